@@ -20,14 +20,13 @@ from pipeline.simulate.facts import (
     CATALOGUE,
     LAYOUTS,
     VEHICLES,
-    CommandTopic,
+    DriveTopic,
     EffectSpec,
     Layout,
     ParameterSpec,
     PoseTopic,
     SimulateError,
     Vehicle,
-    WheelTopic,
     find_layout,
     find_vehicle,
     read_facts,
@@ -37,7 +36,7 @@ from pipeline.simulate.facts import (
 from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
-from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, publish
+from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, list_topics, publish
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
     INCIDENTS,
@@ -217,19 +216,9 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
 
     scenario = run.scenario
     layout = find_layout(scenario.recording.layout, scenario.vehicle)
-    tables = (
-        publish(run, layout.topics)
-        if layout.topics
-        else [
-            *messages.command_tables(run, layout),
-            *messages.wheel_tables(run, layout),
-            *messages.pose_tables(run, layout.pose),
-            *messages.static_tables(run, layout),
-            *messages.imu_tables(run, layout),
-            *messages.state_tables(run),
-            *messages.decoy_tables(run),
-        ]
-    )
+    tables = publish(run, layout.topics or list_topics(layout, scenario))
+    if not layout.topics:
+        tables += [*messages.state_tables(run), *messages.decoy_tables(run)]
     if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
         write_protobuf(messages.cut_gaps(run, tables), scenario.clock, path, marked=marked)
         return

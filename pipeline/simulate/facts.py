@@ -285,26 +285,20 @@ def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
 #
 # The names are those of the published recordings and of common robot configurations.
 
-CommandForm = Literal[
+DriveForm = Literal[
     "joint_state", "float_sides", "twist", "twist_stamped", "ackermann", "float_speed_steering"
 ]
-WheelForm = Literal["joint_state", "float_sides", "ackermann", "float_speed_steering"]
 PoseContent = Literal["odometry", "pose_stamped", "pose_covariance", "tf"]
 
 
 @dataclass(frozen=True)
-class CommandTopic:
-    """Topics of a command: one, or a pair (left, right) or (speed, steering)."""
+class DriveTopic:
+    """Topics of a command or of measured wheels: one, or a pair (left, right) or (speed, steering).
 
-    form: CommandForm
-    topics: tuple[str, ...]
+    No encoder reports twists.
+    """
 
-
-@dataclass(frozen=True)
-class WheelTopic:
-    """Topics of measured wheels: one, or a pair (left, right) or (speed, steering)."""
-
-    form: WheelForm
+    form: DriveForm
     topics: tuple[str, ...]
 
 
@@ -331,8 +325,8 @@ class Layout:
     """
 
     kind: Kind
-    commands: tuple[CommandTopic, ...]
-    wheels: tuple[WheelTopic, ...]
+    commands: tuple[DriveTopic, ...]
+    wheels: tuple[DriveTopic, ...]
     pose: PoseTopic
     imu: str = ""
     joints: str = "{}_wheel"
@@ -340,8 +334,8 @@ class Layout:
 
 
 def _read_layout(given: dict[str, Any]) -> Layout:
-    commands = msgspec.convert(given.pop("commands"), tuple[CommandTopic, ...])
-    wheels = msgspec.convert(given.pop("wheels", []), tuple[WheelTopic, ...])
+    commands = msgspec.convert(given.pop("commands"), tuple[DriveTopic, ...])
+    wheels = msgspec.convert(given.pop("wheels", []), tuple[DriveTopic, ...])
     return Layout(given.pop("kind"), commands, wheels, PoseTopic(**given.pop("pose")), **given)
 
 

@@ -11,6 +11,8 @@ Source = Literal[
     "odometry",
     "filter",
     "localization",
+    "tracking",
+    "relocalization",
     "satellites",
     "correction",
     "imu",
@@ -46,10 +48,11 @@ class Published:
     Attributes:
         topic, type_name: where and what.
         source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
-            ``filter`` the same with the gyro's heading; ``localization``; ``satellites``, its place on Earth
-            and the velocity of its sensor over ground; ``correction``, the transform from
-            the localization's frame to the odometry's; ``imu``; ``battery``; ``once`` at the start;
-            ``wish``, a body command that the controller never gets.
+            ``filter`` the same with the gyro's heading; ``localization``; ``tracking``, the same in a frame
+            that never jumps, and ``relocalization``, where that frame is, dated ahead; ``satellites``, its
+            place on Earth and the velocity of its sensor over ground; ``correction``, the transform from the
+            localization's frame to the odometry's; ``imu``; ``battery``; ``once`` at the start; ``wish``, a
+            body command that the controller never gets.
         fields: by field path a quantity, several for an array, a text of them, or a constant.
         every: one message in so many is published.
         stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.

@@ -23,7 +23,9 @@ from pipeline.logs.writer import LogWriter
 from pipeline.models import find_effect
 from pipeline.models.effect import Place
 from pipeline.run.signals import GROUND_UNOBSERVABLE
-from pipeline.simulate import Encoders, Recording, Scenario, make_scenario, messages, simulate_run, write_log
+from pipeline.simulate import Encoders, Recording, Scenario, make_scenario, simulate_run, write_log
+from pipeline.simulate.facts import find_layout
+from pipeline.simulate.platforms import list_topics
 from pipeline.sources import find_preset
 from pipeline.store import Manifest, Store
 from pipeline.words.objects import diagnosis_as_json
@@ -32,6 +34,7 @@ from pipeline.words.verdict import NO_GROUND
 CASES = Path(__file__).parents[3] / "shared" / "cases" / "logs"
 EFFECTS = {"drive_lag": 0.3, "effective_track": 1.8, "lateral_skid": 0.3}
 """A lag of the drive on slippery ground."""
+POSES = {"localization", "tracking", "relocalization"}
 STAMPS = 1_700_000_000_000_000_000 + np.arange(600) * 50_000_000
 
 
@@ -50,9 +53,10 @@ def make(
 
 def record(scenario: Scenario, path: Path) -> Path:
     """The log of a scenario without its poses."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(messages, "pose_tables", lambda _run, _topic: [])
-        write_log(simulate_run(scenario), path)
+    layout = find_layout(scenario.recording.layout, scenario.vehicle)
+    topics = tuple(one for one in list_topics(layout, scenario) if one.source not in POSES)
+    recording = replace(scenario.recording, layout=replace(layout, topics=topics))
+    write_log(simulate_run(replace(scenario, recording=recording)), path)
     return path
 
 

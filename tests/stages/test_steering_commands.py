@@ -23,12 +23,12 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.simulate.facts import CommandTopic
+from pipeline.simulate.facts import DriveTopic
 from pipeline.simulate.signals import Commands
 from pipeline.sources import find_preset
 from pipeline.store import Manifest
 
-_LAYOUT = replace(LAYOUTS["ackermann"], commands=(CommandTopic("twist_stamped", ("/cmd_vel",)),), wheels=())
+_LAYOUT = replace(LAYOUTS["ackermann"], commands=(DriveTopic("twist_stamped", ("/cmd_vel",)),), wheels=())
 _TOLD = "holds steering angles in place of yaw rates"
 
 

@@ -8,7 +8,7 @@ its fields, each filled from a quantity of the run.
 import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.core import Floats, rigid
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.facts import (
+    DriveTopic,
     Layout,
     PoseTopic,
     SimulateError,
@@ -26,15 +27,16 @@ from pipeline.simulate.facts import (
     open_stream,
     unknown_name,
 )
-from pipeline.simulate.messages import Field, Messages, SimulatedRun
+from pipeline.simulate.messages import LATE_S, Field, Messages, SimulatedRun
 from pipeline.simulate.programs import make_wishes, walk_in_plane
 from pipeline.simulate.published import Json, Published, Q, Source, Value
+from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sensors import to_earth
 from pipeline.simulate.signals import integrate_cells
 
 Series = dict[str, Floats]
 
-_LATE_S = 0.002
+_TF_PERIOD_S, _FUTURE_S = 0.05, 0.1
 _TURN = 2.0 * np.pi
 _COMPASS_OFF_RAD = 0.7
 """An attitude is seldom against the true north."""
@@ -74,13 +76,18 @@ def _fill(value: Value, series: Series, rows: slice) -> Field:
 
 
 def _take(quantity: Q, series: Series, rows: slice) -> Floats:
-    values = quantity.gain * series[quantity.name][rows] + quantity.offset
+    values = series[quantity.name][rows]
+    if (quantity.gain, quantity.offset) != (1.0, 0.0):
+        values = quantity.gain * values + quantity.offset
     return np.floor(values) if quantity.whole else values
 
 
 def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
-    commands, vehicle = run.commands, run.scenario.vehicle
-    left, right = invert_ideal_model(vehicle, commands.speed_mps, commands.turn)
+    commands, vehicle, recording = run.commands, run.scenario.vehicle, run.scenario.recording
+    turned = recording.command_scale if recording.command_turn_scale is None else recording.command_turn_scale
+    left, right = invert_ideal_model(
+        vehicle, recording.command_scale * commands.speed_mps, turned * commands.turn
+    )
     series = {
         "speed": commands.speed_mps,
         "yaw_rate": commands.yaw_rate(vehicle),
@@ -89,7 +96,7 @@ def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
         "right": right,
         "sideways": commands.sideways,
     }
-    return commands.time_s, commands.time_s + run.scenario.recording.command_latency_s, series
+    return commands.time_s, commands.time_s + recording.command_latency_s, series
 
 
 def _of_wish(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
@@ -116,7 +123,7 @@ def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
         for name, values in (("rate", run.imu.rates), ("force", run.imu.accelerations)):
             for i, axis in enumerate("xyz"):
                 series[f"{name}_{axis}"] = np.interp(wheels.time_s, run.imu.time_s, values[:, i])
-    return wheels.time_s, wheels.time_s + _LATE_S, series
+    return wheels.time_s, wheels.time_s + LATE_S, series
 
 
 def _of_odometry(run: SimulatedRun, *, gyro: bool = False) -> tuple[Floats, Floats, Series]:
@@ -140,12 +147,26 @@ def _of_filter(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
 
 def _of_localization(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     position, quaternion = run.poses.in_map()
+    if not run.scenario.pose.reports_heading:
+        quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (quaternion.shape[0], 1))
     ned = rigid.multiply_quaternions(
         np.broadcast_to(_ENU_IN_NED, quaternion.shape),
         rigid.multiply_quaternions(quaternion, np.broadcast_to(_FRD_IN_FLU, quaternion.shape)),
     )
     series = _name(position, quaternion) | {f"ned_q{axis}": ned[:, i] for i, axis in enumerate("xyzw")}
     return run.poses.stamp_s, run.poses.log_s, series
+
+
+def _of_tracking(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    return run.poses.stamp_s, run.poses.log_s, _name(run.poses.position, run.poses.quaternion)
+
+
+def _of_relocalization(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """Localization corrects at its own pace and dates its transform ahead, so that others can look it up."""
+    time = np.arange(0.0, run.scenario.duration_s, _TF_PERIOD_S)
+    which = np.clip(np.searchsorted(run.poses.log_s, time, side="right") - 1, 0, None)
+    turn = rigid.quaternions_from_yaw(run.poses.correction_yaw[which])
+    return time + _FUTURE_S, time + LATE_S, _name(run.poses.correction[which], turn)
 
 
 def _of_satellites(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
@@ -194,7 +215,7 @@ def _of_imu(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     start = np.broadcast_to(rigid.quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
     turn = rigid.multiply_quaternions(start, turn)
     series |= {f"attitude_{axis}": turn[:, i] for i, axis in enumerate("xyzw")}
-    return run.imu.time_s, run.imu.time_s + _LATE_S, series
+    return run.imu.time_s, run.imu.time_s + LATE_S, series
 
 
 def _of_battery(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
@@ -231,6 +252,8 @@ _SOURCES: dict[Source, Callable[[SimulatedRun], tuple[Floats, Floats, Series]]] 
     "odometry": _of_odometry,
     "filter": _of_filter,
     "localization": _of_localization,
+    "tracking": _of_tracking,
+    "relocalization": _of_relocalization,
     "satellites": _of_satellites,
     "correction": _of_correction,
     "imu": _of_imu,
@@ -268,13 +291,20 @@ def pose_fields(position: str, orientation: str) -> dict[str, Q]:
 
 
 def twist(
-    topic: str, *, stamped: bool = False, source: Source = "command", sideways: bool = False
+    topic: str,
+    *,
+    stamped: bool = False,
+    source: Source = "command",
+    sideways: bool = False,
+    frame: str | None = None,
 ) -> Published:
     """A body command; a ``wish`` is one that never reaches the controller."""
     prefix, name = ("twist.", "TwistStamped") if stamped else ("", "Twist")
-    fields = {f"{prefix}linear.x": Q("speed"), f"{prefix}angular.z": Q("yaw_rate")}
+    fields: Fields = {f"{prefix}linear.x": Q("speed"), f"{prefix}angular.z": Q("yaw_rate")}
     if sideways:
         fields[f"{prefix}linear.y"] = Q("sideways")
+    if frame is not None:
+        fields["header.frame_id"] = frame
     return Published(
         topic, f"geometry_msgs/msg/{name}", source, fields, stamp="header" if stamped else "none"
     )
@@ -339,9 +369,12 @@ def _name_joint(template: str, corner: str) -> str:
     return name.replace("wheel", "steering") if corner.startswith("steer") else name
 
 
-def imu(topic: str, *, attitude: bool = False) -> Published:
-    """An inertial unit, perhaps with an attitude."""
+def imu(topic: str, *, attitude: bool = False, is_unknown: bool = False) -> Published:
+    """An inertial unit, perhaps with an attitude, or one that says that it has none."""
     fields: Fields = {"header.frame_id": "imu_link", "orientation.w": 1.0}
+    if is_unknown:
+        nothing = Q("rate_x", 0.0, 0.0)
+        fields["orientation_covariance"] = (replace(nothing, offset=-1.0), *[nothing] * 8)
     if attitude:
         fields |= {f"orientation.{axis}": Q(f"attitude_{axis}") for axis in _XYZW}
     fields |= {f"angular_velocity.{axis}": Q(f"rate_{axis}") for axis in _XYZ}
@@ -386,6 +419,87 @@ _SHARED: dict[str, Callable[..., Published]] = {
         *(imu, fix, ground_velocity, pose_with_covariance, describe),
     )
 }
+
+
+def list_topics(layout: Layout, scenario: Scenario) -> tuple[Published, ...]:
+    """Topics of a log in a layout that says forms of messages only."""
+    sensor = scenario.pose
+    topics = [one for each in layout.commands for one in _list_drive(each, "command", layout, scenario)]
+    if scenario.encoders is not None:
+        topics += [one for each in layout.wheels for one in _list_drive(each, "wheels", layout, scenario)]
+    topics += _list_pose(layout.pose, sensor.child_frame)
+    if layout.pose.form == "tf" and scenario.imu is not None:
+        topics.append(_mount("imu_link", np.zeros(3), 0.0))
+    if sensor.child_frame != "base_link":
+        position = np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0])
+        topics.append(_mount(sensor.child_frame, position, sensor.mount_yaw_rad))
+    if layout.imu and scenario.imu is not None:
+        topics.append(imu(layout.imu, is_unknown=True))
+    return tuple(topics)
+
+
+def _list_drive(one: DriveTopic, source: Source, layout: Layout, scenario: Scenario) -> list[Published]:
+    topic, vehicle = one.topics[0], scenario.vehicle
+    if one.form in {"twist", "twist_stamped"}:
+        stamped = one.form == "twist_stamped"
+        frame = "base_link" if stamped else None
+        return [twist(topic, stamped=stamped, sideways=vehicle.moves_sideways, frame=frame)]
+    if one.form == "ackermann":
+        fields: Fields = {"drive.speed": Q("speed"), "drive.steering_angle": Q("steering")}
+        return [Published(topic, "ackermann_msgs/msg/AckermannDriveStamped", source, fields)]
+    if one.form != "joint_state":
+        names = ("left", "right") if one.form == "float_sides" else ("speed", "steering")
+        return [
+            Published(each, "std_msgs/msg/Float64", source, {"data": Q(name)}, stamp="none")
+            for each, name in zip(one.topics, names, strict=True)
+        ]
+    places = _list_places(vehicle)
+    if source == "command":
+        # A command lists the rear wheels first and an encoder the front ones: only names can tell them apart.
+        asked = joints(topic, layout.joints, places[::-1])
+        return [replace(asked, source=source, fields=_leave_out(asked.fields, "position"))]
+    if vehicle.moves_sideways:
+        made = mecanum_joints(topic, {corner: _name_joint(layout.joints, corner) for corner in places})
+    else:
+        made = joints(topic, layout.joints, places)
+    report = "both" if scenario.encoders is None else scenario.encoders.report
+    lacks = {"position": "velocity", "velocity": "" if vehicle.kind == "ackermann" else "position"}
+    return [replace(made, fields=_leave_out(made.fields, lacks.get(report, "")))]
+
+
+def _leave_out(fields: Mapping[str, Value], name: str) -> Fields:
+    return {path: value for path, value in fields.items() if path != name}
+
+
+def _list_places(vehicle: Vehicle) -> list[str]:
+    """Places of the joints of a vehicle."""
+    if vehicle.kind == "ackermann":
+        return ["rear_left", "rear_right", "steer_front_left", "steer_front_right"]
+    several = [f"axle_{number}_" for number in range(1, vehicle.wheels_per_side + 1)]
+    axles = {1: [""], 2: ["front_", "rear_"]}.get(vehicle.wheels_per_side, several)
+    return [f"{axle}{side}" for axle in axles for side in ("left", "right")]
+
+
+def _list_pose(one: PoseTopic, child: str) -> list[Published]:
+    if one.form == "tf":
+        return [
+            transform(one.topic, "tracking", "odom", "base_link"),
+            transform(one.topic, "relocalization", "map", "odom"),
+        ]
+    if one.form == "pose_stamped":
+        fields: Fields = {**pose_fields("pose.position", "pose.orientation"), "header.frame_id": "map"}
+        return [Published(one.topic, "geometry_msgs/msg/PoseStamped", "localization", fields)]
+    if one.form == "pose_covariance":
+        return [pose_with_covariance(one.topic, 1)]
+    return [odometry(one.topic, "localization", "map", child)]
+
+
+def _mount(child: str, position: Floats, yaw: float) -> Published:
+    """Where a sensor is on the vehicle."""
+    made = transform("/tf_static", "once", "base_link", child)
+    series = _name(position[None], rigid.quaternions_from_yaw(np.array([yaw])))
+    known = {path: float(series[one.name][0]) for path, one in made.fields.items() if isinstance(one, Q)}
+    return replace(made, fields={**made.fields, **known})
 
 
 def _read_value(given: Any) -> Value:  # noqa: ANN401 - as the file has it
