@@ -136,13 +136,16 @@ _MOST_PAIRS = 10
 
 
 _FEW = 3
-"""Differences and notes on the screen without `--all`."""
+"""Differences on the screen without `--all`."""
+_NOTES = 2
+"""Notes on the screen without `--all`."""
 
 
 def _list_notes(notes: Sequence[str], *, everything: bool) -> list[str]:
-    shown = notes if everything else notes[:_FEW]
+    shown = notes if everything else notes[:_NOTES]
     lines = [f"! {note}" for note in shown]
-    return [*lines, f"  {len(notes) - _FEW} more notes (--all, page)"] if len(notes) > len(shown) else lines
+    rest = format_count(len(notes) - len(shown), "more note")
+    return [*lines, f"  {rest} (--all, page)"] if len(notes) > len(shown) else lines
 
 
 def _format_answer(answer: Answer, written: Mapping[str, Path], *, everything: bool) -> list[str]:
@@ -153,6 +156,8 @@ def _format_answer(answer: Answer, written: Mapping[str, Path], *, everything: b
     lines: list[str] = []
     title = ""
     for line in list_lines(answer):
+        if line.input != answer.input and not everything:
+            continue
         if title_line(line) != title:
             title = title_line(line)
             lines += [""] * bool(lines) + [f"slip of {title}"]
@@ -162,7 +167,9 @@ def _format_answer(answer: Answer, written: Mapping[str, Path], *, everything: b
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
-    lines += [] if everything else ["", "all datasets and pairs, with intervals: --all, or the page"]
+    others = [INPUT_WORDS[name] for name in answer.inputs if name != answer.input]
+    rest = ", ".join([*others, "all datasets and pairs with intervals"])
+    lines += [] if everything else ["", f"{rest}: --all, or the page"]
     notes = _list_notes(list_shown_notes(answer), everything=everything)
     return [
         *lines,

@@ -32,7 +32,14 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import open_model
-from pipeline.core import TREND_THRESHOLD, SlipError, format_count, format_interval, suffix_unit
+from pipeline.core import (
+    TREND_THRESHOLD,
+    SlipError,
+    format_count,
+    format_digits,
+    format_interval,
+    suffix_unit,
+)
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
@@ -183,6 +190,8 @@ def _render(checked: Check, to: Literal["markdown", "junit"]) -> str:
 
 _LABEL = 26
 _LEVEL = 9
+_ROWS = 8
+"""Parameters of a vehicle on a screen of 24 lines, those of most runs first."""
 _SPREADS = (
     ("spread_terrain", "between terrains"),
     ("spread_run", "between runs"),
@@ -204,6 +213,7 @@ def build_fleet() -> App:
 def fit(  # noqa: D417 - the results folder documents itself
     results: Results = Path("results"),
     *,
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -213,6 +223,7 @@ def fit(  # noqa: D417 - the results folder documents itself
     Writes fleet.json, fleet.parquet and fleet.html.
 
     Args:
+        everything: also print parameters without an interval, spreads between terrains and runs, and reasons.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -224,15 +235,18 @@ def fit(  # noqa: D417 - the results folder documents itself
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
     content = {**summarize_fleet(model), "file": str(path)}
-    return print_result(content, lambda: _format_fleet(content), json=json, quiet=quiet)
+    return print_result(
+        content, lambda: _format_fleet(content, everything=everything), json=json, quiet=quiet
+    )
 
 
 def show(  # noqa: D417 - the results folder documents itself
-    results: Results = Path("results"), *, json: bool = False, quiet: bool = False
+    results: Results = Path("results"), *, everything: All = False, json: bool = False, quiet: bool = False
 ) -> int:
     """Show the fleet model that was fitted last.
 
     Args:
+        everything: as for `slip fleet fit`.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -240,33 +254,55 @@ def show(  # noqa: D417 - the results folder documents itself
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     content = read_fleet(Store(results))
-    return print_result(content, lambda: _format_fleet(content), json=json, quiet=quiet)
+    return print_result(
+        content, lambda: _format_fleet(content, everything=everything), json=json, quiet=quiet
+    )
 
 
-def _format_fleet(content: Mapping[str, object]) -> list[str]:
+def _format_fleet(content: Mapping[str, object], *, everything: bool) -> list[str]:
     rows = cast("Sequence[Mapping[str, object]]", content["parameters"])
     runs = cast("Mapping[str, Sequence[str]]", content["runs"])
     lines = [str(content["summary"])]
     width = max([_LABEL, *(len(f"{row['effect']}.{row['parameter']}") + 2 for row in rows)])
+    hidden = 0
     for vehicle, names in runs.items():
         own = [row for row in rows if row["vehicle"] == vehicle]
+        known = [row for row in own if row["low"] is not None] or own
+        shown = own if everything else known[:_ROWS]
+        hidden += len(own) - len(shown)
         lines.append(f"{vehicle}: {format_count(len(names), 'run')}")
-        lines += [_format_number(row, width) for row in own] or ["  no significant effect in any of them"]
+        lines += [_format_number(row, width, everything=everything) for row in shown] or [
+            "  no significant effect in any of them"
+        ]
         reasons: dict[str, list[str]] = {}
-        for row in own:
+        for row in own if everything else ():
             reasons.setdefault(str(row["because"]), []).append(f"{row['effect']}.{row['parameter']}")
         lines += [f"  {', '.join(labels)}: {because}" for because, labels in reasons.items()]
     notes = [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
-    return [*lines, *notes]
+    if everything:
+        return [*lines, *notes]
+    others = [format_count(hidden, "more parameter")] if hidden else []
+    rest = f"{', '.join([*others, 'spreads, and why each has its level'])}: --all, or the page"
+    noted = [f"{format_count(len(notes), 'note')}: --all, or the page"] if notes else []
+    return [*lines, rest, *noted]
 
 
-def _format_number(row: Mapping[str, object], width: int) -> str:
+def _format_number(row: Mapping[str, object], width: int, *, everything: bool) -> str:
     label = f"{row['effect']}.{row['parameter']}"
     unit = suffix_unit(row["unit"])
-    spreads = [f"{words} {format_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
+    spreads = [
+        f"{words} {format_value(row[key])}"
+        for key, words in (_SPREADS if everything else ())
+        if row[key] is not None
+    ]
     value = f"{format_value(row['value'])}{unit}"
-    if row["low"] is not None:
-        value += f" [{format_value(row['low'])}, {format_value(row['high'])}]"
+    terrains = cast("Mapping[str, Mapping[str, float]]", row["terrains"] or {})
+    if row["level"] == "terrain" and len(terrains) > 1 and not everything:
+        means = (f"{name} {format_digits(of['value'])}" for name, of in sorted(terrains.items()))
+        value = f"{', '.join(means)}{unit}"
+    elif row["low"] is not None:
+        middle, low, high = (float(str(row[key])) for key in ("value", "low", "high"))
+        value = format_interval(middle, low, high, row["unit"])
     numbers = ", ".join([value, *spreads])
     name = "" if row["name"] == row["effect"] else f": {row['name']}"
     return f"  {row['level'] or 'open':<{_LEVEL}}{label:<{width}}{numbers}{name}"
