@@ -37,7 +37,7 @@ _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
     "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
     "command": {
         "late_s": "late_s = 0",
-        "unit": 'unit = "m/s"',
+        "unit": 'unit = "rad/s"',
         "yaw_unit": 'yaw_unit = "rad/s"',
         "steering_unit": 'steering_unit = "rad"',
     },
@@ -68,10 +68,9 @@ class Given:
         """Whether the vehicle's geometry is known."""
         return self.vehicle.id != UNKNOWN_VEHICLE
 
-    @property
-    def moves_sideways(self) -> bool:
+    def may_move_sideways(self, sources: Sources) -> bool:
         """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
-        drives = dict.fromkeys((*self.sources.rank_drives("command"), *self.sources.rank_drives("wheels")))
+        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
         return self.vehicle.kinematics.has_inputs("sideways") or any(
             find_sideways_share(self.data.topics, one) for one in drives
         )
@@ -151,8 +150,19 @@ class Case:
             section = msgspec.structs.replace(self.configuration.command, time="log")
             by_log = msgspec.structs.replace(self.configuration, command=section)
             self.extraction = Extraction(given.data, equal, by_log, self.vehicle, given.where)
-        self.moves_sideways = given.moves_sideways
+        self.moves_sideways = given.may_move_sideways(self.sources)
         self.driven: Explained | None = None
+
+    def leave_out(self, source: DriveSource) -> None:
+        """Take a candidate for no role."""
+        for role in ("command", "wheels"):
+            chosen = getattr(self.sources, role)
+            rest = [one for one in self.sources.rank_drives(role) if one.signals != source.signals]
+            if chosen is not None and chosen not in rest:
+                chosen = rest[0] if rest else None
+            others = {**self.sources.others, role: tuple(one for one in rest if one is not chosen)}
+            notes = tuple(note for note in self.sources.notes if source.signals[0].topic not in note)
+            self.sources = replace(self.sources, others=others, notes=notes, **{role: chosen})
 
     # Signals.
 

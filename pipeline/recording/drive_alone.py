@@ -41,7 +41,7 @@ def examine_drive(given: Given) -> Recording | None:
     Returns:
         The recording; None if no candidate for wheels turns, or there is no command.
     """
-    if given.moves_sideways:
+    if given.may_move_sideways(given.sources):
         # Of its motion to the side only the wheels of a known vehicle show anything.
         return _take_by_name(given.sources, given.configuration) if given.is_known else None
     return _stand_in(Case(given))

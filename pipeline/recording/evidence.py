@@ -29,8 +29,8 @@ _NEARLY_BACK_DEG = 135.0
 """Angle from which on half a turn is nearer than a quarter."""
 _CONCENTRATED = 0.6
 """Concentration of the course above which its angle means anything."""
-_ONE_LINE = 0.9
-"""Share of the motion asked for along one line, from which on it tells no direction from another."""
+ONE_LINE = 0.9
+"""Share of a motion along one line of the body, from which on it tells no direction from another."""
 
 
 def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, float, float | None]:
@@ -109,7 +109,7 @@ def _find_frame_across(motion: Motion, part: Motion, asked: Complex) -> tuple[Mo
     quarters = 90.0 * round(angle / 90.0)
     if abs(angle - quarters) <= _USUAL_DEG:
         angle = quarters
-    elif abs(np.sum(asked**2)) > _ONE_LINE * float(np.sum(np.abs(asked) ** 2)):
+    elif abs(np.sum(asked**2)) > ONE_LINE * float(np.sum(np.abs(asked) ** 2)):
         # Along one line, a heading that is off is a ground on which the body slips aside, too.
         return motion, 0.0
     margin, gain = compare(blocks, usual), float((blocks - usual).sum()) / part.moved.size
@@ -441,6 +441,19 @@ _USUAL = 3.0
 def is_named_measured(name: str) -> bool:
     """Whether a name says that a signal is measured, and not that it is commanded."""
     return bool(MEASURED.search(name.lower())) and not COMMANDED.search(name.lower())
+
+
+_EQUAL = 0.02
+"""Deviation of a gain from one within which a signal measures the motion."""
+
+
+def equal_motion(one: Reading) -> tuple[bool, bool]:
+    """Whether the numbers of a body's motion equal what it does, at once: ahead, and turning."""
+    made = one.explained
+    if made is None or one.form != "body" or not made.is_sure or made.lag + made.delay >= _LEAD_S:
+        return False, False
+    ahead, turned = (abs(float(each.gains[0]) - 1.0) < _EQUAL for each in (made.ahead, made.turned))
+    return ahead, turned
 
 
 def rate_command(one: Reading, rank: int, earliest: float) -> float:

@@ -10,13 +10,20 @@ from pipeline.recording.case import Case, Given
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.delays import settle_delay
 from pipeline.recording.encoders import settle_wheels
+from pipeline.recording.evidence import equal_motion
 from pipeline.recording.geometry import Geometry, explain_wheels, measure_lengths
 from pipeline.recording.kinds import find_kind, leave_out_steered, report_turn
 from pipeline.recording.motion import measure_motion
 from pipeline.recording.mounting import report_mounting
 from pipeline.recording.readings import Reading
-from pipeline.recording.roles import choose_roles, name_sources, read_drives, settle_stamps
-from pipeline.recording.score import FEWEST_STEPS
+from pipeline.recording.roles import (
+    choose_roles,
+    leave_out_of_ground,
+    name_sources,
+    read_drives,
+    settle_stamps,
+)
+from pipeline.recording.score import CLEAR, FEWEST_STEPS
 from pipeline.recording.signs import report_signs, turn_motion
 from pipeline.recording.units import find_units, settle_gyro, settle_lengths
 from pipeline.run import Alignment
@@ -71,9 +78,11 @@ class Recording:
     alignment: Alignment | None = None
     cut: Cut | None = None
 
-
-_EQUAL = 0.02
-"""Deviation of both gains from one within which a signal measures the motion."""
+    @property
+    def is_followed(self) -> bool:
+        """Whether the pose follows what drives the vehicle, as far as the log tells."""
+        known = [one for one in self.evidence if one.margin is not None and one.role != "gyro"]
+        return not known or any((one.margin or 0.0) > CLEAR for one in known)
 
 
 def examine(given: Given) -> Recording:
@@ -90,6 +99,7 @@ def examine(given: Given) -> Recording:
     except SlipError:
         # The stage `extract` raises it again.
         return as_given
+    leave_out_of_ground(case, given, motion)
     drives = read_drives(case, motion)
     gyros = [] if gyro is None else [gyro]
     readings = [*(drive.reading for drive in drives), *gyros]
@@ -141,7 +151,7 @@ def describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
         return Evidence(reading.name, role, why)
     gains = (float(made.ahead.gains[0]), float(made.turned.gains[0]))
     reason = "" if role else "another is as likely" if made.is_sure else "the motion does not follow it"
-    if not role and made.is_sure and max(abs(gain - 1.0) for gain in gains) < _EQUAL:
+    if not role and all(equal_motion(reading)):
         reason = "it measures the motion"
     return Evidence(
         reading.name,

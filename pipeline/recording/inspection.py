@@ -162,11 +162,11 @@ def _choose(
     chosen: Choice | None = None
     try:
         require_messages(index)
-        chosen = choose(index, configuration, options.overrides)
-        require_sources(chosen.sources, index, options)
+        chosen = report_unused(choose(index, configuration, options.overrides), index)
+        require_sources(chosen, index, options)
     except SlipError as error:
         return chosen or _choose_by_name(index, configuration), error
-    return report_unused(chosen, index), None
+    return chosen, None
 
 
 def _choose_by_name(index: LogIndex, configuration: Configuration) -> Choice | None:

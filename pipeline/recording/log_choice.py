@@ -489,6 +489,18 @@ def _compare(
             findings.append(Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)))
         sources = replace_pose(sources, ratings)
     recording = examine(Given(data, sources, configuration, chosen.vehicle, where=str(index.path)))
+    for other in _list_equals(ratings) if not recording.is_followed else ():
+        instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
+        made = examine(Given(data, instead, configuration, chosen.vehicle, where=str(index.path)))
+        if made.is_followed:
+            text = (
+                f"{other.source} is taken for the pose, and not {ratings[0].source}: the vehicle moves as it "
+                "does; the other is of another body"
+            )
+            findings.append(Finding("pose_of_another", "info", text, where="pose"))
+            ratings = (other, *(one for one in ratings if one is not other))
+            recording = made
+            break
     # Candidates are rated as recorded, without intervals, and with the wheels that were chosen by name.
     roles = recording.sources.command, recording.sources.wheels
     as_rated = (
@@ -496,16 +508,23 @@ def _compare(
         and sources.interval is None
         and roles == (chosen.sources.command, chosen.sources.wheels)
     )
-    made = ratings[0].made if ratings and as_rated else None
+    extracted = ratings[0].made if ratings and as_rated else None
     return replace(
         chosen,
         sources=recording.sources,
         ratings=tuple(replace(rating, made=None) for rating in ratings),
         findings=(*findings, *recording.findings),
         data=data,
-        extracted=made,
+        extracted=extracted,
         recording=recording,
     )
+
+
+def _list_equals(ratings: Sequence[PoseRating]) -> list[PoseRating]:
+    """Candidates for the pose that names and frames rate as the best one."""
+    return [
+        one for one in ratings[1:] if not (one.refusal or one.from_wheels) and one.score == ratings[0].score
+    ]
 
 
 def _release_columns(chosen: Choice) -> Choice:

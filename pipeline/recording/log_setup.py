@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
-from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
+from pipeline.logs import TRANSFORM_TYPES, LogIndex, list_fields, open_log
 from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.log_choice import Choice, choose
+from pipeline.recording.unused import list_unused
 from pipeline.run import Alignment
 from pipeline.sources import (
-    COMMANDED,
     Configuration,
     DriveForm,
     MessageType,
@@ -26,7 +21,7 @@ from pipeline.sources import (
     load_configuration,
     plain_type,
 )
-from pipeline.stages import Finding, Severity, blame_damage
+from pipeline.stages import blame_damage
 
 UNKNOWN = "unknown"
 
@@ -83,11 +78,10 @@ def set_up_log(path: Path, options: LogOptions, index: LogIndex | None = None) -
     )
     recorded = index.deployment
     require_messages(index)
-    chosen = choose(index, configuration, options.overrides)
-    require_sources(chosen.sources, index, options)
+    chosen = report_unused(choose(index, configuration, options.overrides), index)
+    require_sources(chosen, index, options)
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
-    chosen = report_unused(chosen, index)
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
@@ -96,61 +90,7 @@ def set_up_log(path: Path, options: LogOptions, index: LogIndex | None = None) -
 
 def report_unused(chosen: Choice, index: LogIndex) -> Choice:
     """The choice with findings on what might be wheels or commands, and is not used."""
-    return replace(chosen, findings=(*chosen.findings, *_list_unused(index, chosen.sources)))
-
-
-def _list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
-    """Findings on numbers that may be those of a left and a right wheel, and whose type does not say so."""
-    drives = [drive for drive in (sources.command, sources.wheels) if drive is not None]
-    used = {signal.topic for drive in drives for signal in drive.signals}
-    fields = {
-        topic: numbers.field
-        for topic, kind in index.types.items()
-        if topic not in used and (numbers := find_type(kind).numbers) is not None
-    }
-    wanted = [Wanted(topic, (field,)) for topic, field in fields.items()]
-    findings = []
-    for columns in read_topics(index, wanted, sha256="unused", skip_unfit=True).topics if wanted else ():
-        topic, field = columns.topic, fields[columns.topic]
-        column = columns.fields.get(field)
-        values = column.fixed() if isinstance(column, Ragged) else None
-        if values is None or values.shape[1] != 2 or not np.ptp(values, axis=0).all():  # noqa: PLR2004 - two sides
-            continue
-        role = "command" if COMMANDED.search(topic.lower()) else "wheels"
-        text = (
-            f"not used: {topic} (two numbers a message), whose meaning is not known; if they are the left "
-            f'and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
-            f'right_topic = "{topic}.{field}[1]"; unit = "rad/s" (or "m/s", "rpm", "rad")'
-        )
-        severity: Severity = "info" if getattr(sources, role) else "warning"
-        findings.append(Finding("numbers_not_used", severity, text, where=topic))
-    return findings if sources.wheels is not None else [*findings, *_list_sides(index, used)]
-
-
-_OF_A_WHEEL = re.compile("wheel|motor|rpm|tick|encoder|count|speed|vel")
-
-
-_MOST_SIDES = 3
-"""Maximum number of pairs that are named."""
-
-
-def _list_sides(index: LogIndex, used: Collection[str]) -> Iterator[Finding]:
-    """Findings on pairs of numbers that are named as those of left and right wheels, of unknown types."""
-    unknown = {
-        topic: paths
-        for topic, paths in list_fields(index).items()
-        if topic not in used and find_type(index.types.get(topic, "")) == MessageType()
-    }
-    numbers = {f"{topic}.{path}": topic for topic, paths in unknown.items() for path in paths}
-    pairs = ((left, left.replace("left", "right")) for left in numbers if "left" in left)
-    named = ((left, right) for left, right in pairs if right in numbers and _OF_A_WHEEL.search(left.lower()))
-    for left, right in islice(named, _MOST_SIDES):
-        text = (
-            f"not used: {left} and {right}, whose meaning is not known; if they are the left and right "
-            f'wheels, in run.toml: [wheels] left_topic = "{left}"; right_topic = "{right}"; unit = "rad/s" '
-            '(or "m/s", "rpm", "rad", "ticks" with per_turn)'
-        )
-        yield Finding("numbers_not_used", "warning", text, where=numbers[left])
+    return replace(chosen, findings=(*chosen.findings, *list_unused(index, chosen.sources)))
 
 
 def require_messages(index: LogIndex) -> None:
@@ -166,12 +106,13 @@ def require_messages(index: LogIndex) -> None:
         raise RecordingError("log_without_messages", what, where=str(index.path), hint=hint)
 
 
-def require_sources(sources: Sources, index: LogIndex, options: LogOptions) -> None:
+def require_sources(chosen: Choice, index: LogIndex, options: LogOptions) -> None:
     """Refuse a log without a pose, or without any of the inputs that are asked for.
 
     Raises:
         RecordingError: ``no_pose``, ``no_command``.
     """
+    sources = chosen.sources
     topics = {channel.topic: f"{channel.topic} ({channel.type_name})" for channel in index.channels}
     empty = {channel.topic for channel in index.channels if channel.message_count == 0}
     there = ", ".join(text for topic, text in sorted(topics.items()) if topic not in empty)
@@ -193,7 +134,9 @@ def require_sources(sources: Sources, index: LogIndex, options: LogOptions) -> N
         what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
         named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
         is_there = _may_be_named(index, "drive", "number", "numbers", "joints")
-        hint = f"{named if is_there else _RECORD_DRIVE}. The log has: {there}."
+        unused = [one.text for one in chosen.findings if one.id == "numbers_not_used"]
+        named = ". ".join([*(unused or [_RECORD_DRIVE]), *([named] if is_there else [])])
+        hint = f"{named[0].upper()}{named[1:]}. The log has: {there}."
         raise RecordingError("no_command", what, where=str(index.path), hint=hint)
 
 

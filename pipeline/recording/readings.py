@@ -56,6 +56,7 @@ class Held:
         self.is_constant = not (enough and bool(np.ptp(read) > 0.0))
         self.moves = not self.is_constant or (enough and may_stand and bool(read.any()))
         self._sums: dict[float, Floats] = {}
+        self._is_known = enough
         if not enough:
             return
         self._start = float(self.times[0]) - 1.0
@@ -77,6 +78,8 @@ class Held:
 
     def is_there(self, steps: Steps) -> Flags:
         """Whether the signal is recorded over each step and .4 s before."""
+        if not self._is_known:
+            return np.zeros(steps.start.size, dtype=bool)
         index = np.arange(self._missing.size)
         first, last = (
             np.interp((at - self._start) / GRID_S, index, self._missing)

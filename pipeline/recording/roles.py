@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core import Floats, format_duration
-from pipeline.recording.case import Candidate, Case
-from pipeline.recording.evidence import is_named_measured, rate_command
+from pipeline.recording.case import Candidate, Case, Given
+from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
 from pipeline.recording.kinds import settle_turn
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
 from pipeline.recording.units import settle_steering
 from pipeline.run import LIVE_SHARE
-from pipeline.sources import CONFIGURED, DriveForm, DriveSource, Sources
+from pipeline.sources import COMMANDED, CONFIGURED, DriveForm, DriveSource, Sources
 from pipeline.stages import Finding
 
 _STILL = 0.1
@@ -54,6 +54,36 @@ def read_drives(case: Case, motion: Motion) -> list[Candidate]:
         settle_steering(case, drive, motion)
         settle_turn(case, drive, motion)
     return _leave_out_sizes(case, drives)
+
+
+def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
+    """Leave out velocities along the axes of a map: turned by the heading, they are of rolling wheels."""
+    if not case.moves_sideways or case.vehicle.kinematics.has_inputs("sideways"):
+        return
+    of_role = (case.sources.rank_drives(role) for role in ("command", "wheels"))
+    drives = {source.signals: source for sources in of_role for source in sources}
+    at = 0.5 * (motion.steps.start + motion.steps.end)
+    for source in drives.values():
+        reading = None
+        if source.form is DriveForm.BODY and source.reason != CONFIGURED:
+            reading = case.read(source, is_measured=True)
+        if reading is None or reading.first is None or reading.third is None or not reading.third.moves:
+            continue
+        last = np.searchsorted(reading.first.times, at, side="right") - 1
+        velocity = np.interp(at, reading.first.times, reading.first.values) + 1j * np.interp(
+            at, reading.third.times, reading.third.values
+        )
+        velocity, heading = velocity[last >= 0], motion.middle[last >= 0]
+        power = max(float(np.sum(np.abs(velocity) ** 2)), 1e-12)
+        lines = [abs(np.sum(one**2)) / power for one in (velocity, velocity * np.exp(-1j * heading))]
+        if lines[0] < ONE_LINE < lines[1]:
+            text = (
+                f"not used: {source}: its velocities are along the axes of a map, and not ahead and to the "
+                "left of the body"
+            )
+            case.findings.append(Finding("numbers_not_used", "info", text, where=source.signals[0].topic))
+            case.leave_out(source)
+    case.moves_sideways = given.may_move_sideways(case.sources)
 
 
 def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading | None:
@@ -107,11 +137,7 @@ def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]
             "body is driven forward and backward"
         )
         case.findings.append(Finding("wheels_unsigned", "warning", text, where="wheels"))
-        for role in ("command", "wheels"):
-            if getattr(case.sources, role) == one.source:
-                others = case.sources.rank_drives(role)
-                instead = next((other for other in others if other.signals != one.source.signals), None)
-                case.sources = replace(case.sources, **{role: instead})  # type: ignore[arg-type]
+        case.leave_out(one.source)
     return signed
 
 
@@ -139,7 +165,12 @@ def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | N
             if command is not None:
                 _report_command(case, best, command)
             command = best
-    wheels = _find(drives, case.sources.wheels)
+    if command is not None and _is_no_command(command):
+        text = f"not used: {command.source}: it measures the motion, which equals it at once"
+        where = command.source.signals[0].topic
+        case.findings.append(Finding("numbers_not_used", "info", text, where=where))
+        case.sources, command = replace(case.sources, command=None), None
+    wheels = _find_wheels(case, drives, command)
     if wheels is not None and command is not None and wheels.source.signals == command.source.signals:
         # What is named as a command measures what the other asks for.
         is_sides = named is not None and named is not command and named.reading.form == "sides"
@@ -157,6 +188,34 @@ def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | N
         if wheels is not None and command is not None and command.reading.form == "sides":
             wheels = wheels if is_named_measured(wheels.reading.name) else None
     return command, wheels
+
+
+_HELD = 0.5
+"""Share of samples that repeat the one before, from which on a signal is held, as commands are."""
+
+
+def _is_no_command(one: Candidate) -> bool:
+    """Whether a candidate for a command states the motion as it is, and changes as it does."""
+    is_named = one.source.reason == CONFIGURED or COMMANDED.search(str(one.source).lower())
+    if one.is_measured or is_named or not any(equal_motion(one.reading)):
+        return False
+    return float(np.mean([each.held_share for each in one.reading.inputs])) < _HELD
+
+
+def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | None) -> Candidate | None:
+    """Wheels by type and name, or others that the motion follows where it does not follow these."""
+    source = case.sources.wheels
+    wheels = _find(drives, source)
+    is_open = wheels is None or (not wheels.is_sure and not wheels.reading.dead_side)
+    if source is None or source.reason == CONFIGURED or not is_open:
+        return wheels
+    others = [one for one in drives if one.is_measured and one.is_sure and one not in (wheels, command)]
+    if not others:
+        return wheels
+    why = "no speeds of both sides are found in it" if wheels is None else "the motion does not follow it"
+    text = f"not used: {source}: {why}; {others[0].source} is taken for the wheels"
+    case.findings.append(Finding("wheels_left_out", "info", text, where="wheels"))
+    return others[0]
 
 
 def _is_still(case: Case, drives: Sequence[Candidate]) -> bool:

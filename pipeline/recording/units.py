@@ -130,6 +130,25 @@ def find_units(case: Case, command: Candidate | None, wheels: Candidate | None) 
         _report_units(case, "command", command, units, gains)
     if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
         _find_wheel_unit(case, command, wheels)
+    if command is not None and command.reading.form == "sides" and _is_usable(command):
+        _find_side_unit(case, command, wheels)
+
+
+_ALIKE = 1.5
+"""Speeds of wheels over those commanded up to which both are in one unit: others are nine times apart."""
+
+
+def _find_side_unit(case: Case, command: Candidate, wheels: Candidate | None) -> None:
+    """Unit of commanded wheel speeds: that of the wheels that follow them, else by the motion."""
+    driven, unit = case.driven, case.changes.get("wheels", {}).get("unit")
+    if wheels is not None and wheels.reading.form == "sides" and driven is not None:
+        if unit is not None and abs(np.log(abs(float(driven.ahead.gains[0])))) < np.log(_ALIKE):
+            what = f"the wheel speeds of {command.source} are in {unit}, as those that are measured"
+            case.correct("command", what, f'unit = "{unit}"', {"unit": unit})
+    elif wheels is None and command.reading.explained is not None and command.sign("ahead"):
+        explained = command.reading.explained
+        radius = case.vehicle.wheel_radius_m if case.is_known else None
+        correct_wheel_unit(case, command, float(explained.ahead.gains[0]), explained.shares[0], radius)
 
 
 def _find_speed_units(case: Case, command: Candidate, wheels: Candidate) -> None:
@@ -197,7 +216,8 @@ def correct_wheel_unit(
     case: Case, wheels: Candidate, gain: float, share: float, radius: float | None = None
 ) -> None:
     """Correct the unit of wheel speeds, unless the type or the user gives it; see `find_wheel_unit`."""
-    if wheels.source.signals[0].unit or case.configuration.wheels.unit is not None:
+    role = "wheels" if wheels.is_measured else "command"
+    if wheels.source.signals[0].unit or getattr(case.configuration, role).unit is not None:
         return
     unit = find_wheel_unit(gain, share, str(wheels.source), radius)
     what = f"the wheel speeds of {wheels.source} are in "
@@ -205,10 +225,10 @@ def correct_wheel_unit(
     if not unit:
         what += f"no usual unit (ticks, or turns before a gear?){taken}"
         scale = float(f"{gain / TAKEN_M:.4g}")
-        case.correct("wheels", what, f"scale = {scale:g}", {"scale": scale})
+        case.correct(role, what, f"scale = {scale:g}", {"scale": scale})
     elif unit != "rad/s":
         what += f"{unit}{taken if unit == 'm/s' else ''}"
-        case.correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
+        case.correct(role, what, f'unit = "{unit}"', {"unit": unit})
 
 
 def _is_usable(drive: Candidate) -> bool:

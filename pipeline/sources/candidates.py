@@ -197,9 +197,9 @@ class Sources:
                     return one
         return None
 
-    def separated(self, copy: str = "") -> Sources:
-        """The same, but with measured wheels from another topic than the pose, or than a copy of it."""
-        poses = {copy, *(() if self.pose is None else (self.pose.topic,))}
+    def separated(self, *copies: str) -> Sources:
+        """The same, but with measured wheels from another topic than the pose, or than copies of it."""
+        poses = {*copies, *(() if self.pose is None else (self.pose.topic,))}
         ranked = self.rank_drives("wheels")
         free = [one for one in ranked if not {signal.topic for signal in one.signals} <= poses]
         chosen = free[0] if free else None
@@ -220,7 +220,7 @@ DEAD_RECKONED = re.compile(
     r"controller|wheel|encoder|diff_drive|drive_odom|platform/odom|dead|unfiltered|/odom$"
 )
 LOCALIZED = re.compile(
-    r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
+    r"icp|slam|lidar|laser|map|locali|local_position|global_position|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
     r"|kiss|/pf/|particle|qualisys"
 )
 FILTERED = re.compile(r"(?<!un)filter|ekf|ukf|fused|merged|combined")

@@ -406,10 +406,10 @@ class _Chooser:
         if pose is not None and not (pose.orientation or pose.angle):
             is_position = LOCALIZED.search(name) or _PLACE.search(name)
             return (1.0, PoseSource(topic, "positions by its type and name")) if is_position else None
-        if DEAD_RECKONED.search(name):
-            return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
         if LOCALIZED.search(name):
             return 3.0, PoseSource(topic, "a localization by its name")
+        if DEAD_RECKONED.search(name):
+            return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
         return 2.0, PoseSource(topic, "a pose by its type")
 
     def choose_imu(self, topic: str | None) -> TopicSource | None:

@@ -270,13 +270,15 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     period = float(np.median(np.diff(samples.times)))
     path = float(np.hypot(ideal[known, 0], ideal[known, 1]).sum() * period)
+    positions = samples.position[known]
+    net = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
     turned = float(np.abs(ideal[known, 2]).sum() * period)
     if path < _NET_OF_NO_MOTION and turned < _NET_OF_NO_MOTION:
         text = f"the vehicle was hardly commanded to move: {path:.2g} m of path in the whole run"
+        if net > _NET_OF_NO_MOTION:
+            text += f", but it moved, {net:.2g} m far: it was pushed, or what drove it is not recorded"
         return [Finding("not_moving", "error", text, value=path)]
     gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in range(3)]
-    positions = samples.position[known]
-    net = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
     still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
     # Wheels on a stand, or in a test of steps, may turn as much back as ahead.
     nowhere = not samples.is_drive_alone and net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION

@@ -87,6 +87,12 @@ class Recorded:
     header_time: Stamps | None
     clock: str | None = None
 
+    @property
+    def is_stamped(self) -> bool:
+        """Whether header stamps tell messages apart: some drivers never set them, or set them once."""
+        header = self.header_time
+        return header is not None and bool(np.ptp(header) if header.size > 1 else header.any())
+
 
 @dataclass(frozen=True)
 class TopicClock:
@@ -182,7 +188,7 @@ def _close_pauses(
             now, header, off = closed[key], times.header_time, offsets[key]
             moved = np.where(times.log_time <= last, shift, 0)
             stamps = now.header_time
-            if header is not None and stamps is not None and header.any():
+            if header is not None and stamps is not None and times.is_stamped:
                 if off is None:
                     stamps = stamps + moved
                 elif not 0 < after - last + off[1] - off[0] < PAUSE_NS:
@@ -214,11 +220,7 @@ def _follow_simulated_time(
     time themselves.
     """
     stamped = sorted(
-        (
-            times
-            for times in recorded.values()
-            if times.header_time is not None and times.clock is None and times.header_time.any()
-        ),
+        (times for times in recorded.values() if times.clock is None and times.is_stamped),
         key=lambda times: -times.log_time.size,
     )
     for leading in stamped:
@@ -247,7 +249,7 @@ def _follow(
     mapped, real = {}, []
     for key, times in recorded.items():
         header, log = times.header_time, clock_map.follow(times.log_time)
-        if header is not None and header.any():
+        if header is not None and times.is_stamped:
             away = [abs(float(np.median(clock - header))) for clock in (times.log_time, log)]
             if away[0] < _APART_NS < away[1]:
                 header = clock_map.follow(header)
@@ -272,7 +274,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
     headers = {
         key: times.header_time
         for key, times in recorded.items()
-        if times.header_time is not None and times.clock is None and times.header_time.any()
+        if times.header_time is not None and times.clock is None and times.is_stamped
     }
     counts = {
         key: header > DAY_NS if float(np.median(header)) > DAY_NS else np.ones(header.size, dtype=bool)
@@ -308,7 +310,7 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
     """Sending times of topics without stamps that a bridge recorded in bunches."""
     findings, even = [], dict(recorded)
     for key, times in recorded.items():
-        if times.clock is not None or (times.header_time is not None and times.header_time.any()):
+        if times.clock is not None or times.is_stamped:
             continue
         log = _draw_evenly(times.log_time)
         if log is times.log_time:
@@ -383,10 +385,11 @@ def _read_clock(times: Recorded) -> TopicClock:
     if times.clock == "publish":
         return TopicClock(times.topic, "publish", times.publish_time, times.publish_time > 0)
     header = times.header_time
-    if times.clock == "log" or header is None or not header.any():
+    if times.clock == "log" or header is None or not times.is_stamped:
         findings: list[Finding] = []
-        if header is not None and not header.any():
-            text = f"the header stamps of {times.topic} are all zero: log times were used"
+        if header is not None and not times.is_stamped:
+            same = "the same" if header.any() else "zero"
+            text = f"the header stamps of {times.topic} are all {same}: log times were used"
             findings.append(Finding("no_header_stamp", "warning", text, where=times.topic))
         usable = np.ones(times.log_time.size, dtype=bool)
         return TopicClock(times.topic, "log", times.log_time, usable, findings=tuple(findings))

@@ -504,7 +504,17 @@ class Extraction:
         made = locate_vehicle(receiver, beside, imu, self._read_ahead(), lever)
         self.findings += [*findings, *made.findings]
         if not made.rows.size:
-            raise self._nothing("pose", source.topic)
+            times = receiver.times[receiver.order]
+            if times.size < reading.FEWEST_MESSAGES:
+                raise self._nothing("pose", source.topic)
+            rate = 1.0 / max(float(np.median(np.diff(times))), 1e-3)
+            slow = f" (at least {pose_topics.SLOW_HZ:g} Hz are needed)" if rate < pose_topics.SLOW_HZ else ""
+            what = (
+                f"the positions of {source.topic} come at {rate:.2g} Hz{slow} and show no course that can be "
+                "the heading of the vehicle"
+            )
+            hint = "Record an IMU beside them, a faster receiver, or a localization with a heading."
+            raise StageError("no_pose", what, where=self.where, hint=hint)
         return made.rows, made.arrays
 
     def _timed(self, topic: str) -> reading.Receiver | None:

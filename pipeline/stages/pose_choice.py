@@ -73,7 +73,7 @@ class PoseRating:
         refusal: why it is unusable; empty if it is usable.
         made: tables extracted for the rating, without intervals; of the best candidate only.
         position: its positions [m], shape (n, 2), until copies are found.
-        same_as: wheel odometry with the same positions; empty if there is none.
+        same_as: a topic with the same positions, wheel odometry or the best candidate; empty without one.
     """
 
     source: PoseSource
@@ -119,7 +119,13 @@ def rate_poses(
         ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
-    return tuple(replace(_find_copy(one, ratings), position=None) for one in ratings)
+    found = [_find_copy(one, ratings) for one in ratings]
+    best, of_best = found[0], _round_positions(found[0])
+    if not best.from_wheels:
+        for number, one in enumerate(found[1:], start=1):
+            if len(of_best & _round_positions(one)) > _COPIED * max(len(of_best), 1):
+                found[number] = replace(one, same_as=str(best.source))
+    return tuple(replace(one, position=None) for one in found)
 
 
 _COPIED: Final = 0.9
@@ -374,7 +380,9 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
         **sources.others,
         "pose": tuple(replace(one.source, reason=one.refusal or one.reason) for one in ratings[1:]),
     }
-    return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated(best.same_as)
+    return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated(
+        best.same_as, *(one.source.topic for one in ratings[1:] if one.same_as)
+    )
 
 
 def find_steady_gain(moved: Floats, driven: Floats) -> float | None:

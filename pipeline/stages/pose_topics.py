@@ -282,6 +282,8 @@ def _find_apart(t: Floats, p: Floats, q: Floats, breaks: Flags, settings: Veloci
         return np.column_stack([np.linalg.norm(one, axis=1) for one in increments])
 
     moves = spans > 0.0
+    if not moves.any():
+        return apart
     usual = np.quantile(measure(1)[moves] / spans[moves, None], 0.9, axis=0)
 
     def is_far(places: int) -> Flags:

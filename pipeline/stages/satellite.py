@@ -271,7 +271,7 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
         )
     share = float(np.mean(~np.isfinite(yaw)))
     text = (
-        f"the heading of {topic} is its course over ground, since nothing that turns with the vehicle was "
+        f"the heading of {topic} is its course over ground, since no IMU that turns with it was "
         "recorded or agrees: lateral slip is not observable and reads zero"
     )
     if share:

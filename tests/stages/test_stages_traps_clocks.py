@@ -76,9 +76,10 @@ def test_trap_5_stamps_later_than_their_log_times_prove_a_clock_error() -> None:
     ]
 
 
-def test_trap_5_header_stamps_that_are_all_zero_are_said_and_replaced() -> None:
+@pytest.mark.parametrize("stamp", [0, START], ids=["zero", "of the start"])
+def test_trap_5_header_stamps_that_are_all_the_same_are_said_and_replaced(stamp: int) -> None:
     log = START + EVERY_50_MS
-    stamps, ids = align(pose=recorded(log, np.zeros_like(log)))
+    stamps, ids = align(pose=recorded(log, np.full_like(log, stamp)))
     assert np.array_equal(stamps["pose"], log)
     assert ids == {"no_header_stamp"}
 

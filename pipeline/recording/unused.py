@@ -1,0 +1,134 @@
+"""Numbers that may be the wheels or the command of a log, of types that do not say so: how to use them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
+
+import numpy as np
+
+from pipeline.logs import LogIndex, Ragged, Wanted, list_fields, read_topics
+from pipeline.sources import COMMANDED, MEASURED, MessageType, Sources, find_type, plain_type
+from pipeline.stages import Finding, Severity
+
+_RIGHT_OF: Mapping[str, str] = {
+    "left": "right", "port": "starboard", "l": "r",
+    "fl": "fr", "rl": "rr", "bl": "br", "lf": "rf", "lr": "rr",
+}  # fmt: skip
+"""The word of the right side for one of the left."""
+_LEFT = re.compile(
+    r"(?i:left)|(?<![A-Za-z])(?i:port|fl|rl|bl|lf|lr|l)(?![A-Za-z])|(?<![A-Za-z])[lL](?=(?i:wheel|motor|enc))"
+    r"|(?<=[a-z])(?:FL|RL|BL|LF|LR|L)(?![A-Za-z])"
+)
+_OF_A_WHEEL = re.compile("wheel|motor|rpm|tick|enc|count|speed|vel|pwm|duty|throttle")
+_NOT_OF_TURNING = re.compile("curr|volt|temp|torque|effort|error|fault|power|status|radius|diameter|pressure")
+_COMMANDED = re.compile(COMMANDED.pattern + "|pwm|duty|throttle")
+_SPEED = re.compile(r"^(speed|velocity|linear(_velocity|_speed|_x)?|forward(_speed)?|v|vx|v_x|throttle)$")
+_TURN = re.compile(r"^(yaw_?rate|turn_?rate|omega|angular(_velocity|_speed|_z)?|turn|w|wz|w_z)$")
+_STEER = re.compile(r"^(steering(_angle)?|steer|delta)$")
+_JOYSTICK = "sensor_msgs/Joy"
+_UNITS: Mapping[str, str] = {
+    "tick|count|enc": '; unit = "ticks"; per_turn = 1000 (ticks of a whole turn)',
+    "rpm": '; unit = "rpm"',
+}
+_ANY_UNIT = ' (the motion shows their unit; unit = "rad/s", "m/s", "rpm" or "rad" gives it)'
+_MOST = 3
+"""Maximum number of lines that are offered for a role."""
+
+
+def list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
+    """Findings on numbers that may be wheels or a command where the log has none, or on pairs of numbers."""
+    drives = [drive for drive in (sources.command, sources.wheels) if drive is not None]
+    used = {signal.topic for drive in drives for signal in drive.signals}
+    found = _list_pairs(index, sources, used)
+    if sources.wheels is not None and sources.command is not None:
+        return found
+    unknown = {
+        topic: paths
+        for topic, paths in list_fields(index).items()
+        if topic not in used and find_type(index.types.get(topic, "")) == MessageType()
+    }
+    missing = {role for role in ("command", "wheels") if getattr(sources, role) is None}
+    sides = list(_list_sides(unknown))
+    for role in sorted(missing):
+        found += islice((one for one in sides if one.text.find(f"[{role}]") >= 0), _MOST)
+    if "command" in missing:
+        found += islice(_list_commands(unknown, index), _MOST)
+    return found
+
+
+def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> list[Finding]:
+    """Messages of two numbers that may be those of a left and a right wheel."""
+    fields = {
+        topic: numbers.field
+        for topic, kind in index.types.items()
+        if topic not in used and (numbers := find_type(kind).numbers) is not None
+    }
+    wanted = [Wanted(topic, (field,)) for topic, field in fields.items()]
+    findings = []
+    for columns in read_topics(index, wanted, sha256="unused", skip_unfit=True).topics if wanted else ():
+        topic, field = columns.topic, fields[columns.topic]
+        column = columns.fields.get(field)
+        values = column.fixed() if isinstance(column, Ragged) else None
+        if values is None or values.shape[1] != 2 or not np.ptp(values, axis=0).all():  # noqa: PLR2004 - two sides
+            continue
+        role = "command" if COMMANDED.search(topic.lower()) else "wheels"
+        text = (
+            f"not used: {topic} (two numbers a message), whose meaning is not known; if they are the left "
+            f'and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
+            f'right_topic = "{topic}.{field}[1]"{_ANY_UNIT}'
+        )
+        severity: Severity = "info" if getattr(sources, role) else "warning"
+        findings.append(Finding("numbers_not_used", severity, text, where=topic))
+    return findings
+
+
+def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[Finding]:
+    """Pairs of numbers that are named as those of left and right wheels, of unknown types."""
+    numbers = {f"{topic}.{path}": topic for topic, paths in unknown.items() for path in paths}
+    for left, topic in numbers.items():
+        right, lower = _LEFT.sub(_name_right, left), left.lower()
+        if right == left or right not in numbers or _NOT_OF_TURNING.search(lower):
+            continue
+        if not _OF_A_WHEEL.search(lower):
+            continue
+        role = "command" if _COMMANDED.search(lower) and not MEASURED.search(lower) else "wheels"
+        unit = next((text for word, text in _UNITS.items() if re.search(word, lower)), _ANY_UNIT)
+        text = (
+            f"not used: {left} and {right}, whose meaning is not known; if they are the left and right "
+            f'wheels, in run.toml: [{role}] left_topic = "{left}"; right_topic = "{right}"{unit}'
+        )
+        yield Finding("numbers_not_used", "warning", text, where=topic)
+
+
+def _name_right(found: re.Match[str]) -> str:
+    word = found[0]
+    right = _RIGHT_OF[word.lower()]
+    return right.upper() if word.isupper() else right.capitalize() if word[0].isupper() else right
+
+
+def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> Iterator[Finding]:
+    """Messages with a speed and a turn that may be a command, and joysticks."""
+    for topic, paths in unknown.items():
+        if MEASURED.search(topic.lower()):
+            continue
+        if plain_type(index.types[topic]) == _JOYSTICK:
+            text = (
+                f"not used: {topic} (a joystick); if two of its axes are the command, in run.toml: "
+                f'[command] speed_topic = "{topic}.axes[1]"; yaw_rate_topic = "{topic}.axes[0]" (which axes, '
+                "the set-up of its driver says)"
+            )
+            yield Finding("numbers_not_used", "warning", text, where=topic)
+            continue
+        ends = {path: path.rpartition(".")[2].lower() for path in paths}
+        speeds = [path for path, end in ends.items() if _SPEED.search(end)]
+        turns = [("yaw_rate_topic", path) for path, end in ends.items() if _TURN.search(end)]
+        turns += [("steering_topic", path) for path, end in ends.items() if _STEER.search(end)]
+        if speeds and turns:
+            key, turn = turns[0]
+            text = (
+                f"not used: {topic} (a speed and a turn), whose meaning is not known; if it is the command, "
+                f'in run.toml: [command] speed_topic = "{topic}.{speeds[0]}"; {key} = "{topic}.{turn}"'
+            )
+            yield Finding("numbers_not_used", "warning", text, where=topic)

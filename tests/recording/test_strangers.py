@@ -1,0 +1,189 @@
+"""Logs of strangers: what is not the vehicle's is told from what is, nothing is left out in silence."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_drives import (
+    DrawnDrive,
+    DrawnTopic,
+    record_cdr,
+    record_json,
+    record_twist,
+    stamp_ros,
+    write_drawn,
+)
+from drawn_motion import RADIUS, TRACK, draw
+
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.core import Floats, SlipError
+from pipeline.recording.log_setup import LogSetup, set_up_log
+
+POSE = "geometry_msgs/msg/PoseStamped"
+TWIST = "geometry_msgs/msg/TwistStamped"
+JOINTS = "sensor_msgs/msg/JointState"
+
+
+class Robot:
+    """A robot that follows its commands late, at 10 Hz: what it is asked, what it does, and its wheels."""
+
+    def __init__(self, seed: int = 71) -> None:
+        drive = draw(seed)
+        at = drive.rows
+        left, right = drive.wheels()
+        place = drive.place
+        self.asked = DrawnDrive(drive.time[at], *drive.asked[at].T, x=place.real, y=place.imag, yaw=drive.yaw)
+        self.does = DrawnDrive(
+            drive.time[at], drive.speed[at], drive.rate[at], place.real, place.imag, drive.yaw
+        )
+        self.wheels = np.column_stack([left[at], right[at]])
+
+    def command(self) -> DrawnTopic:
+        return record_twist(self.asked)
+
+    def pose(self, topic: str = "/lio/pose") -> DrawnTopic:
+        fields = stamp_ros(self.does) | self.does.pose("pose.") | {"header.frame_id": "map"}
+        return record_cdr(self.does, topic, POSE, fields)
+
+    def velocity(self, topic: str, *, of_map: bool) -> DrawnTopic:
+        speed, yaw = self.does.speed, self.does.yaw * of_map
+        linear = {"twist.linear.x": speed * np.cos(yaw), "twist.linear.y": speed * np.sin(yaw)}
+        return record_cdr(self.does, topic, TWIST, linear | {"twist.angular.z": self.does.turn})
+
+    def joints(self, topic: str, names: list[str], rates: Floats) -> DrawnTopic:
+        fields = {"name": [names] * len(rates), "velocity": [[*map(float, row)] for row in rates]}
+        return record_cdr(self.does, topic, JOINTS, stamp_ros(self.does) | fields)
+
+    def base(self, topic: str = "/joint_states") -> DrawnTopic:
+        return self.joints(topic, ["left_wheel_joint", "right_wheel_joint"], self.wheels)
+
+    def number(self, topic: str, values: Floats, kind: str = "Float64") -> DrawnTopic:
+        return record_cdr(self.does, topic, f"std_msgs/msg/{kind}", {"data": values})
+
+
+def set_up(tmp_path: Path, *topics: DrawnTopic) -> LogSetup:
+    return set_up_log(write_drawn(tmp_path / "log.mcap", *topics), Options(out=tmp_path))
+
+
+def told(setup: LogSetup) -> str:
+    return " ".join(one.text for one in setup.choice.findings)
+
+
+def test_velocities_along_the_axes_of_a_map_make_no_mecanum(tmp_path: Path) -> None:
+    robot = Robot()
+    velocity = robot.velocity("/robot/velocity", of_map=True)
+    setup = set_up(tmp_path, robot.command(), velocity, robot.base(), robot.pose())
+    assert (str(setup.sources.command), str(setup.sources.wheels)) == ("/cmd_vel", "/joint_states")
+    assert setup.vehicle.kind == "differential"
+    assert setup.vehicle.track_width_m == pytest.approx(TRACK, rel=0.03)
+    assert "not used: /robot/velocity: its velocities are along the axes of a map" in told(setup)
+
+
+@pytest.mark.parametrize("of_map", [False, True], ids=["body", "map"])
+def test_a_measured_motion_is_no_command_where_nothing_else_is_recorded(
+    of_map: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    robot = Robot()
+    with pytest.raises(SlipError, match=r"Not used: /robot/velocity: it.* (measures|axes)") as caught:
+        set_up(tmp_path, robot.velocity("/robot/velocity", of_map=of_map), robot.pose())
+    assert caught.value.code == "no_command"
+
+
+@pytest.mark.parametrize("names", [["joint_1", "joint_2"], ["left_elbow", "right_elbow"]], ids=["one", "two"])
+def test_joints_of_an_arm_are_not_taken_for_the_wheels(names: list[str], tmp_path: Path) -> None:
+    robot = Robot()
+    time = robot.does.time
+    arm = robot.joints("/arm/joint_states", names, np.column_stack([np.sin(time), np.cos(0.7 * time)]))
+    setup = set_up(tmp_path, robot.command(), arm, robot.base("/base/joint_states"), robot.pose())
+    assert str(setup.sources.wheels) == "/base/joint_states"
+    assert "not used: /arm/joint_states" in told(setup)
+    assert setup.vehicle.wheel_radius_m == pytest.approx(RADIUS, rel=0.03)
+
+
+def test_of_two_bodies_the_one_that_is_driven_is_the_vehicle(tmp_path: Path) -> None:
+    robot, person = Robot(), Robot(seed=72)
+    poses = robot.pose("/mocap/robot/pose"), person.pose("/mocap/helmet/pose")
+    setup = set_up(tmp_path, robot.command(), *poses)
+    assert str(setup.sources.pose) == "/mocap/robot/pose"
+    assert "is taken for the pose, and not /mocap/helmet/pose" in told(setup)
+
+
+def test_commanded_wheel_speeds_are_in_the_unit_of_those_that_follow(tmp_path: Path) -> None:
+    robot = Robot()
+    turn = 0.5 * TRACK * robot.asked.turn
+    asked = {"left": robot.asked.speed - turn, "right": robot.asked.speed + turn}
+    topics = [robot.number(f"/{side}_wheel/command", values) for side, values in asked.items()]
+    for side, rate in zip(asked, robot.wheels.T, strict=True):
+        topics.append(robot.number(f"/{side}_wheel/velocity", RADIUS * rate))
+    setup = set_up(tmp_path, *topics, robot.pose())
+    assert setup.configuration.wheels.unit == setup.configuration.command.unit == "m/s"
+
+
+def record_own(robot: Robot, topic: str, kind: str, fields: Mapping[str, Floats]) -> DrawnTopic:
+    rows = zip(*(values.tolist() for values in fields.values()), strict=True)
+    return record_json(robot.does, topic, kind, [dict(zip(fields, row, strict=True)) for row in rows])
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "unit"),
+    [
+        ("/base.rpm_fl", "/base.rpm_fr", 'unit = "rpm"'),
+        ("/base.motorL_speed", "/base.motorR_speed", "the motion shows their unit"),
+        ("/lwheel.data", "/rwheel.data", "the motion shows their unit"),
+        ("/left_encoder.data", "/right_encoder.data", 'unit = "ticks"; per_turn'),
+    ],
+)
+def test_sides_are_known_by_any_of_their_usual_names(
+    left: str, right: str, unit: str, tmp_path: Path
+) -> None:
+    robot = Robot()
+    fields = dict(zip((left, right), robot.wheels.T, strict=True))
+    if left.endswith(".data"):
+        topics = [
+            robot.number(name.removesuffix(".data"), np.cumsum(values).astype(int), "Int32")
+            for name, values in fields.items()
+        ]
+    else:
+        own = {name.partition(".")[2]: values for name, values in fields.items()}
+        topics = [record_own(robot, "/base", "own.Base", own)]
+    said = told(set_up(tmp_path, robot.command(), *topics, robot.pose()))
+    assert f'[wheels] left_topic = "{left}"; right_topic = "{right}"' in said
+    assert unit in said
+
+
+def test_a_command_of_an_own_type_and_a_joystick_are_offered(tmp_path: Path) -> None:
+    robot = Robot()
+    asked = {"speed": robot.asked.speed, "turn_rate": robot.asked.turn}
+    command = record_own(robot, "/drive", "own.Drive", asked)
+    axes = np.column_stack([robot.asked.turn, robot.asked.speed])
+    joystick = record_cdr(robot.asked, "/joy", "sensor_msgs/msg/Joy", {"axes": axes}, "float32[] axes")
+    said = told(set_up(tmp_path, command, joystick, robot.base(), robot.pose()))
+    assert '[command] speed_topic = "/drive.speed"; yaw_rate_topic = "/drive.turn_rate"' in said
+    assert "/joy (a joystick)" in said
+
+
+def test_fixes_once_a_second_are_said_to_be_too_slow(tmp_path: Path) -> None:
+    robot = Robot()
+    east, north = np.stack([robot.does.x, robot.does.y]) + np.random.default_rng(73).normal(size=(2, 1000))
+    degrees = {"latitude": 47.0 + north / 111_000.0, "longitude": 8.0 + east / 75_000.0}
+    fixes = record_cdr(
+        robot.does, "/fix", "sensor_msgs/msg/NavSatFix", stamp_ros(robot.does) | degrees,
+        rows=np.arange(0, robot.does.time.size, 10),
+    )  # fmt: skip
+    log = write_drawn(tmp_path / "log.mcap", robot.command(), fixes)
+    with pytest.raises(SlipError, match=r"come at 1 Hz .at least 4 Hz are needed. and show no course"):
+        analyze_log(log, Options(out=tmp_path / "results", report=False, diagnosis=False))
+
+
+def test_a_robot_that_is_pushed_is_not_said_to_stand(tmp_path: Path) -> None:
+    robot = Robot()
+    idle = record_twist(replace(robot.asked, speed=0.0 * robot.asked.speed, turn=0.0 * robot.asked.turn))
+    log = write_drawn(tmp_path / "log.mcap", idle, robot.pose())
+    made = analyze_log(log, Options(out=tmp_path / "results", report=False, diagnosis=False))
+    said = " ".join(made.manifest.read("findings")["text"].to_list())
+    assert "but it moved" in said
+    assert "it was pushed" in said
