@@ -25,7 +25,7 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.stages import Extraction, Finding, find_sideways_share
+from pipeline.stages import CommandTimeout, Extraction, Finding, find_sideways_share
 
 TAKEN_M = 0.1
 """Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
@@ -152,6 +152,7 @@ class Case:
             self.extraction = Extraction(given.data, equal, by_log, self.vehicle, given.where)
         self.moves_sideways = given.may_move_sideways(self.sources)
         self.driven: Explained | None = None
+        self.timeout: CommandTimeout | None = None
 
     def leave_out(self, source: DriveSource) -> None:
         """Take a candidate for no role."""
@@ -285,9 +286,9 @@ class Case:
         changes = self.changes.get("command", {})
         return SPEEDS[str(changes.get("unit", "m/s"))], RATES[str(changes.get("yaw_unit", "rad/s"))]
 
-    def wheel_factor(self) -> float:
+    def wheel_factor(self, role: str = "wheels") -> float:
         """Factor from the radius of raw wheel speeds to that of rad/s."""
-        changes = self.changes.get("wheels", {})
+        changes = self.changes.get(role, {})
         if changes.get("unit") == "m/s":
             return TAKEN_M
         return 1.0 / WHEELS[str(changes.get("unit", "rad/s"))] / float(str(changes.get("scale", 1.0)))

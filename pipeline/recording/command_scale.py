@@ -256,7 +256,9 @@ def measure_command(
     rates = motion.rates if got.is_empty() and motion is not None else None
     if rates is None and not got.is_empty():
         rates = roll(got, vehicle)
+    # Stops that were asked for tell it best, where there are any.
     timeout = None if rates is None else find_timeout(*rates, asked, vehicle)
+    timeout = timeout or case.timeout
     if timeout is not None:
         hold_s = made.command.hold_s or timeout.seconds
         case.changes.setdefault("command", {})["hold_s"] = hold_s

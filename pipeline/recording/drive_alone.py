@@ -20,6 +20,7 @@ from pipeline.recording.motion import Motion
 from pipeline.recording.outages import leave_out
 from pipeline.recording.roles import choose_roles
 from pipeline.recording.score import CLEAR
+from pipeline.recording.timeouts import settle_timeout
 from pipeline.recording.units import correct_wheel_unit
 from pipeline.run import GROUND_UNOBSERVABLE
 from pipeline.sources import (
@@ -87,9 +88,10 @@ def _stand_in(case: Case) -> Recording | None:
         reading = case.read(wheels.source, is_measured=True, kind=kind, section=case.complete().wheels)
         rolled = None if reading is None else roll_wheels(reading)
         if reading is not None and rolled is not None:
-            wheels.reading = reading
+            wheels.reading, motion = reading, rolled
             for one in commands:
                 one.reading.explain(rolled)
+    settle_timeout(case, command, wheels, motion)
     if wheels.reading.form == "sides":
         report_dead(case, wheels, "the log holds no pose in its rank")
         _find_unit(case, wheels, command)

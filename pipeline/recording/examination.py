@@ -25,6 +25,7 @@ from pipeline.recording.roles import (
 )
 from pipeline.recording.score import CLEAR, FEWEST_STEPS
 from pipeline.recording.signs import report_signs, turn_motion
+from pipeline.recording.timeouts import settle_timeout
 from pipeline.recording.units import find_units, settle_gyro, settle_lengths
 from pipeline.run import Alignment
 from pipeline.sources import Configuration, Sources
@@ -106,6 +107,7 @@ def examine(given: Given) -> Recording:
     motion = turn_motion(case, motion, readings)
     command, wheels = choose_roles(case, drives)
     settle_stamps(case, command)
+    settle_timeout(case, command, wheels, motion)
     report_turn(case, command)
     motion = settle_lengths(case, motion, readings, command, wheels)
     is_judged = settle_wheels(case, command, wheels, motion)

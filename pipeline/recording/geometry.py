@@ -259,7 +259,7 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
         sides = wheels
     if sides is not None and sides.is_sure and not is_crossed(sides) and sides.reading.explained is not None:
         rolled, effective = measure_geometry(sides.reading.explained)
-        factor = case.wheel_factor()
+        factor = case.wheel_factor("wheels" if sides is wheels else "command")
         made = replace(made, rolled=_scale(rolled, factor), effective=effective)
     if (
         command is not None
@@ -272,7 +272,7 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
         speed, rate = case.command_factors()
         radius = _scale(radius, speed * case.wheel_factor())
         made = replace(made, radius=radius, track=_scale(track, speed / rate))
-    changes = case.changes.get("wheels", {})
+    changes = case.changes.get("command" if sides is command else "wheels", {})
     return replace(made, is_taken="scale" in changes or changes.get("unit") == "m/s")
 
 

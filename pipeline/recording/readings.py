@@ -50,6 +50,7 @@ class Held:
             known &= np.abs(times - np.median(times[known])) < _LONGEST_S
         self.times, self.values = times[known], values[known]
         live = np.ones(self.values.size, dtype=bool) if counts is None else counts[known]
+        self.live, self.may_stand = live, may_stand
         read = self.values[live]
         # A command that is sent on changes only has few messages, and says something all the time.
         enough = read.size >= (_FEWEST_CHANGES if may_stand else FEWEST_STEPS)
@@ -142,6 +143,10 @@ class Bent(Held):
         """The same with an angle in another unit."""
         times, angle = self._recorded
         return Bent(self._speed, times, factor * angle)
+
+    def drive(self, speed: Held) -> Bent:
+        """The same with another speed."""
+        return Bent(speed, *self._recorded)
 
     def lagged(self, lag: float) -> Floats:
         """The product on the grid, both factors after a first-order lag."""
@@ -310,7 +315,7 @@ class Reading:
         may_cross = self.form in {"sides", "body"} and len(two) == len(SIDES)
         may_cross = may_cross and (self.third is None or self.third_crossed is not None)
         patterns = (False, True) if may_cross else (False,)
-        tried = {crossed: self._fit(motion, delays, crossed=crossed) for crossed in patterns}
+        tried = {crossed: self.fit_to(motion, delays, crossed=crossed) for crossed in patterns}
         # Laps of one radius are explained either way, for speed and yaw rate are proportional: where the
         # command explains the motion as it is, nothing is reversed.
         if may_cross and self.form == "body" and min(tried[False].shares) > _AS_IT_IS:
@@ -338,7 +343,8 @@ class Reading:
         ahead, yaw = motion.body.real, motion.yaw
         return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
 
-    def _fit(self, motion: Motion, delays: Floats, *, crossed: bool) -> Explained:
+    def fit_to(self, motion: Motion, delays: Floats, *, crossed: bool) -> Explained:
+        """Fit all of a motion, with the sign of one side as given; see `explain`."""
         lag, delay = self._find_delay(motion, delays, crossed=crossed)
         ahead, yaw = motion.body.real, motion.yaw
         first, second = self.columns(motion.steps, lag, delay, crossed=crossed)

@@ -148,7 +148,8 @@ def _find_side_unit(case: Case, command: Candidate, wheels: Candidate | None) ->
     elif wheels is None and command.reading.explained is not None and command.sign("ahead"):
         explained = command.reading.explained
         radius = case.vehicle.wheel_radius_m if case.is_known else None
-        correct_wheel_unit(case, command, float(explained.ahead.gains[0]), explained.shares[0], radius)
+        gain = float(explained.ahead.gains[0])
+        correct_wheel_unit(case, command, gain, explained.shares[0], radius, "command")
 
 
 def _find_speed_units(case: Case, command: Candidate, wheels: Candidate) -> None:
@@ -213,10 +214,14 @@ def _find_wheel_unit(case: Case, command: Candidate | None, wheels: Candidate) -
 
 
 def correct_wheel_unit(
-    case: Case, wheels: Candidate, gain: float, share: float, radius: float | None = None
+    case: Case,
+    wheels: Candidate,
+    gain: float,
+    share: float,
+    radius: float | None = None,
+    role: str = "wheels",
 ) -> None:
     """Correct the unit of wheel speeds, unless the type or the user gives it; see `find_wheel_unit`."""
-    role = "wheels" if wheels.is_measured else "command"
     if wheels.source.signals[0].unit or getattr(case.configuration, role).unit is not None:
         return
     unit = find_wheel_unit(gain, share, str(wheels.source), radius)

@@ -187,3 +187,40 @@ def test_a_robot_that_is_pushed_is_not_said_to_stand(tmp_path: Path) -> None:
     said = " ".join(made.manifest.read("findings")["text"].to_list())
     assert "but it moved" in said
     assert "it was pushed" in said
+
+
+def test_a_base_that_gives_up_without_key_presses_is_not_called_slow(tmp_path: Path) -> None:
+    rng, time, timeout_s = np.random.default_rng(74), np.arange(0.0, 150.0, 0.05), 0.6
+    presses, begun = [], 1.0
+    while begun < 140.0:
+        asked = rng.choice([-0.4, 0.3, 0.5]), rng.choice([-0.8, 0.0, 0.8])
+        count = int(rng.integers(1, 6))
+        presses += [(begun + 0.4 * number, *asked) for number in range(count)]
+        begun += 0.4 * count + rng.uniform(1.2, 2.5)
+    at, *asked = np.array(presses).T
+    last = np.searchsorted(at, time, side="right") - 1
+    is_held = (last >= 0) & (time - at[last] < timeout_s)
+    speed, turn = (follow(np.where(is_held, values[last], 0.0), 0.25) for values in asked)
+    yaw = np.cumsum(turn) * 0.05
+    place = np.cumsum(speed * np.exp(1j * yaw)) * 0.05 + rng.normal(0.0, 0.002, time.size)
+    robot = Robot()
+    robot.does = DrawnDrive(time, speed, turn, place.real, place.imag, yaw)
+    rows = np.searchsorted(time, at)
+    said = {
+        f"{kind}.{axis}": values[last]
+        for kind, axis, values in zip(("linear", "angular"), "xz", asked, strict=True)
+    }
+    keys = record_cdr(robot.does, "/cmd_vel", "geometry_msgs/msg/Twist", said, rows=rows)
+    setup = set_up(tmp_path, keys, robot.pose())
+    assert setup.configuration.command.hold_s == pytest.approx(timeout_s, abs=0.06)
+    (command,) = [one for one in setup.choice.recording.evidence if one.role == "command"]
+    assert command.ahead == pytest.approx(1.0, abs=0.05)
+
+
+def follow(values: Floats, lag: float) -> Floats:
+    """A first-order lag of values every .05 s."""
+    made, state = np.zeros_like(values), 0.0
+    for row, value in enumerate(values.tolist()):
+        made[row] = state
+        state += 0.05 / lag * (value - state)
+    return made
