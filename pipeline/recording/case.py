@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError
 from pipeline.logs import LogData
-from pipeline.recording.evidence import RATES, SPEEDS, WHEELS, Axis, Units
+from pipeline.recording.evidence import RATES, RIMS, SPEEDS, WHEELS, Axis, Units
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR
@@ -266,7 +266,7 @@ class Case:
             return
         self.changes.setdefault(section, {}).update(change)
         as_recorded = {**_AS_RECORDED[section]}
-        if change.get("unit") in SPEEDS and change["unit"] != "m/s":
+        if section == "command" and change.get("unit") in SPEEDS and change["unit"] != "m/s":
             as_recorded["unit"] = 'unit = "m/s"'
         settled = [text for key, text in as_recorded.items() if key in change]
         otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
@@ -289,8 +289,8 @@ class Case:
     def wheel_factor(self, role: str = "wheels") -> float:
         """Factor from the radius of raw wheel speeds to that of rad/s."""
         changes = self.changes.get(role, {})
-        if changes.get("unit") == "m/s":
-            return TAKEN_M
+        if changes.get("unit") in RIMS:
+            return TAKEN_M / SPEEDS[str(changes["unit"])]
         return 1.0 / WHEELS[str(changes.get("unit", "rad/s"))] / float(str(changes.get("scale", 1.0)))
 
 

@@ -390,6 +390,8 @@ def _shrink(log: float, share: float) -> float:
     return min(0.0, log - np.log(max(share, 1e-6))) if log < 0.0 else log
 
 
+RIMS = ("m/s", "mm/s", "cm/s")
+"""Units of wheels whose speeds are those of their rims."""
 _METRES = 3.0
 """Surprise of wheels whose speeds are those of their rims [nats]."""
 _OF_METRES = 0.1
@@ -409,7 +411,7 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
         name: of the signals; a unit that it names is no surprise, and "rad/s" is one then.
         radius: of the wheels, if it is known; else about .12 m within a factor of two.
     """
-    words = {"rpm": "rpm", "deg/s": "deg"}
+    words = {"rpm": "rpm", "deg/s": "deg", "mm/s": "mm_?p?_?s", "cm/s": "cm_?p?_?s"}
     named = {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
     spread = 0.7 if radius is None else 0.35
 
@@ -421,13 +423,16 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
         unit: rate(factor, radius or _RADIUS[0], spread) + _STRANGE.get(unit, 0.0) * (not named)
         for unit, factor in WHEELS.items()
     }
-    costs["m/s"] = rate(1.0, 1.0, _OF_METRES) + _METRES
+    costs |= {
+        unit: rate(SPEEDS[unit], 1.0, _OF_METRES) + _METRES + _STRANGE.get(unit, 0.0) * (unit not in named)
+        for unit in RIMS
+    }
     if radius is None:
         costs[""] = float(np.log(_ANY / np.sqrt(2.0 * np.pi))) + _UNUSUAL
     # Of turns before a gear the name is right, and the unit none of the wheels.
     costs = {unit: cost + _NAMED * bool(unit and named - {unit}) for unit, cost in costs.items()}
     best = min(costs, key=lambda unit: costs[unit])
-    least = _CLEAR if best == "m/s" else _WIN
+    least = _CLEAR if best in RIMS else _WIN
     return best if best in named or costs["rad/s"] - costs[best] > least else "rad/s"
 
 

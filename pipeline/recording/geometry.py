@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.core import Floats, format_share, join_parts
 from pipeline.recording.case import Candidate, Case, is_crossed
+from pipeline.recording.evidence import RIMS
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import DELAYS_S, SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
@@ -273,7 +274,7 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
         radius = _scale(radius, speed * case.wheel_factor())
         made = replace(made, radius=radius, track=_scale(track, speed / rate))
     changes = case.changes.get("command" if sides is command else "wheels", {})
-    return replace(made, is_taken="scale" in changes or changes.get("unit") == "m/s")
+    return replace(made, is_taken="scale" in changes or changes.get("unit") in RIMS)
 
 
 def _scale(length: Length | None, factor: float) -> Length | None:

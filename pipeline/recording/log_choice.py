@@ -488,6 +488,14 @@ def _compare(
             )
             findings.append(Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)))
         sources = replace_pose(sources, ratings)
+        if ratings and ratings[0].stands:
+            alone = _let_wheels_stand_in(
+                replace(chosen, sources=replace(sources, pose=None)), index, configuration
+            )
+            if alone.recording is not None:
+                text = f"not used: the poses of {ratings[0].source}: {ratings[0].refusal}"
+                still = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
+                return replace(alone, findings=(*alone.findings, still))
     recording = examine(Given(data, sources, configuration, chosen.vehicle, where=str(index.path)))
     for other in _list_equals(ratings) if not recording.is_followed else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.recording.case import TAKEN_M, Candidate, Case, is_crossed
 from pipeline.recording.evidence import (
     RATES,
+    RIMS,
     SPEEDS,
     USUAL,
     Units,
@@ -232,7 +233,7 @@ def correct_wheel_unit(
         scale = float(f"{gain / TAKEN_M:.4g}")
         case.correct(role, what, f"scale = {scale:g}", {"scale": scale})
     elif unit != "rad/s":
-        what += f"{unit}{taken if unit == 'm/s' else ''}"
+        what += f"{unit}{taken if unit in RIMS else ''}"
         case.correct(role, what, f'unit = "{unit}"', {"unit": unit})
 
 

@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 
 from pipeline.logs import LogIndex, Ragged, Wanted, list_fields, read_topics
+from pipeline.recording.readings import SIDES
 from pipeline.sources import COMMANDED, MEASURED, MessageType, Sources, find_type, plain_type
 from pipeline.stages import Finding, Severity
 
@@ -33,6 +34,8 @@ _UNITS: Mapping[str, str] = {
     "rpm": '; unit = "rpm"',
 }
 _ANY_UNIT = ' (the motion shows their unit; unit = "rad/s", "m/s", "rpm" or "rad" gives it)'
+_WHEELS = {2: "two", 4: "four", 6: "six"}
+"""Numbers of wheels of a vehicle that turns by the speeds of its sides."""
 _MOST = 3
 """Maximum number of lines that are offered for a role."""
 
@@ -59,7 +62,7 @@ def list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
 
 
 def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> list[Finding]:
-    """Messages of two numbers that may be those of a left and a right wheel."""
+    """Messages of a number a wheel, as two of a left and a right one."""
     fields = {
         topic: numbers.field
         for topic, kind in index.types.items()
@@ -71,12 +74,14 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
         topic, field = columns.topic, fields[columns.topic]
         column = columns.fields.get(field)
         values = column.fixed() if isinstance(column, Ragged) else None
-        if values is None or values.shape[1] != 2 or not np.ptp(values, axis=0).all():  # noqa: PLR2004 - two sides
+        count = 0 if values is None else values.shape[1]
+        is_side = count == len(SIDES) or (count in _WHEELS and _OF_A_WHEEL.search(topic.lower()))
+        if values is None or not is_side or not np.ptp(values, axis=0).all():
             continue
         role = "command" if COMMANDED.search(topic.lower()) else "wheels"
         text = (
-            f"not used: {topic} (two numbers a message), whose meaning is not known; if they are the left "
-            f'and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
+            f"not used: {topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they "
+            f'are the left and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
             f'right_topic = "{topic}.{field}[1]"{_ANY_UNIT}'
         )
         severity: Severity = "info" if getattr(sources, role) else "warning"

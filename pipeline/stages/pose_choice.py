@@ -71,6 +71,7 @@ class PoseRating:
         score: higher is better.
         reason: as text.
         refusal: why it is unusable; empty if it is usable.
+        stands: whether it is unusable since it never changes.
         made: tables extracted for the rating, without intervals; of the best candidate only.
         position: its positions [m], shape (n, 2), until copies are found.
         same_as: a topic with the same positions, wheel odometry or the best candidate; empty without one.
@@ -86,6 +87,7 @@ class PoseRating:
     score: float = 0.0
     reason: str = ""
     refusal: str = ""
+    stands: bool = False
     made: Extracted | None = None
     position: Floats | None = None
     same_as: str = ""
@@ -167,7 +169,9 @@ def _rate(
     parent, child = made.frames
     bare = PoseRating(pose, parent, child)
     if poses.height < FEWEST_MESSAGES:
-        return replace(bare, refusal=f"only {poses.height} new poses")
+        said = made.tables["poses"].height
+        refusal = f"only {poses.height} new of {said} poses"
+        return replace(bare, refusal=refusal, stands=said >= FEWEST_MESSAGES)
     time = poses["t"].to_numpy()
     position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
     yaw = np.unwrap(yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
@@ -181,7 +185,8 @@ def _rate(
     drove = path is not None and float(np.hypot(*np.diff(path[1:])).sum()) > _DRIVES_M
     if extent < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
-        return replace(bare, rate_hz=rate, refusal=f"its position never changes while {living}")
+        refusal = f"its position never changes while {living}"
+        return replace(bare, rate_hz=rate, refusal=refusal, stands=True)
     share, sideways = _compare_with_wheels(time, position, yaw, path)
     from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
     # Satellite poses do not depend on the wheels, and a heading from the course shows no sideways motion.

@@ -52,6 +52,14 @@ def test_two_numbers_a_message_are_named_with_the_lines_that_use_them(
     assert "numbers_not_used" not in read_findings(log)
 
 
+def test_four_numbers_of_motors_are_named(tmp_path: Path) -> None:
+    drive = draw_drive()
+    pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
+    speeds = record_numbers(drive, np.tile(wheel_speeds(drive), 2), "/motor_rpm")
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, speeds)
+    assert read_findings(log)["numbers_not_used"].startswith("not used: /motor_rpm (four numbers a message)")
+
+
 @pytest.mark.parametrize(
     "values", [np.zeros((600, 2)), np.ones((600, 3)) * np.arange(600)[:, None]], ids=["still", "three"]
 )

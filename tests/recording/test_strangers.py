@@ -123,6 +123,46 @@ def test_commanded_wheel_speeds_are_in_the_unit_of_those_that_follow(tmp_path: P
     assert setup.configuration.wheels.unit == setup.configuration.command.unit == "m/s"
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("mm/s", 1e3)], ids=["m", "mm"])
+def test_wheel_speeds_of_rims_are_in_the_unit_of_their_name(unit: str, factor: float, tmp_path: Path) -> None:
+    robot = Robot()
+    names = {side: f"/{side}_wheel/{unit.replace('/', '_')}/velocity" for side in ("left", "right")}
+    speeds = [
+        robot.number(name, factor * RADIUS * rate)
+        for name, rate in zip(names.values(), robot.wheels.T, strict=True)
+    ]
+    setup = set_up(tmp_path, robot.command(), *speeds, robot.pose())
+    assert setup.configuration.wheels.unit == unit
+    assert setup.vehicle.track_width_m == pytest.approx(TRACK, rel=0.03)
+
+
+def test_an_odometry_whose_pose_is_not_filled_shows_the_drive(tmp_path: Path) -> None:
+    robot = Robot()
+    left, right = RADIUS * robot.wheels.T
+    fields = {"twist.twist.linear.x": 0.5 * (left + right), "twist.twist.angular.z": (right - left) / TRACK}
+    frames = {
+        "header.frame_id": "odom",
+        "child_frame_id": "base_link",
+        "pose.pose.orientation.w": np.ones(1000),
+    }
+    odometry = record_cdr(
+        robot.does, "/odom", "nav_msgs/msg/Odometry", stamp_ros(robot.does) | fields | frames
+    )
+    setup = set_up(tmp_path, robot.command(), odometry)
+    assert setup.is_drive_alone
+    assert "not used: the poses of /odom: only 1 new of 1000 poses" in told(setup)
+
+
+def test_a_twist_with_covariance_that_is_named_after_wheels_measures_them(tmp_path: Path) -> None:
+    robot = Robot()
+    left, right = RADIUS * robot.wheels.T
+    fields = {"twist.twist.linear.x": 0.5 * (left + right), "twist.twist.angular.z": (right - left) / TRACK}
+    kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+    twist = record_cdr(robot.does, "/wheel_twist", kind, stamp_ros(robot.does) | fields)
+    setup = set_up(tmp_path, robot.command(), twist, robot.pose())
+    assert str(setup.sources.wheels) == "/wheel_twist"
+
+
 def record_own(robot: Robot, topic: str, kind: str, fields: Mapping[str, Floats]) -> DrawnTopic:
     rows = zip(*(values.tolist() for values in fields.values()), strict=True)
     return record_json(robot.does, topic, kind, [dict(zip(fields, row, strict=True)) for row in rows])
