@@ -48,11 +48,11 @@ def settle_timeout(
     follows = motion
     if wheels is not None and len(wheels.reading.inputs) == len(SIDES) and wheels.reading.form != "steering":
         follows = roll_wheels(wheels.reading) or motion
-    found = None if follows is None else find_by_silences(command.reading, follows)
-    if found is None:
+    timeout = None if follows is None else find_by_silences(command.reading, follows)
+    if timeout is None:
         return
-    case.timeout = found
-    command.reading = hold(command.reading, case.configuration.command.hold_s or found.seconds)
+    case.timeout = timeout
+    command.reading = hold(command.reading, case.configuration.command.hold_s or timeout.seconds)
     if motion is not None:
         command.reading.explain(motion)
 

@@ -44,9 +44,9 @@ def list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
     """Findings on numbers that may be wheels or a command where the log has none, or on pairs of numbers."""
     drives = [drive for drive in (sources.command, sources.wheels) if drive is not None]
     used = {signal.topic for drive in drives for signal in drive.signals}
-    found = _list_pairs(index, sources, used)
+    findings = _list_pairs(index, sources, used)
     if sources.wheels is not None and sources.command is not None:
-        return found
+        return findings
     unknown = {
         topic: paths
         for topic, paths in list_fields(index).items()
@@ -55,10 +55,10 @@ def list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
     missing = {role for role in ("command", "wheels") if getattr(sources, role) is None}
     sides = list(_list_sides(unknown))
     for role in sorted(missing):
-        found += islice((one for one in sides if one.text.find(f"[{role}]") >= 0), _MOST)
+        findings += islice((one for one in sides if one.text.find(f"[{role}]") >= 0), _MOST)
     if "command" in missing:
-        found += islice(_list_commands(unknown, index), _MOST)
-    return found
+        findings += islice(_list_commands(unknown, index), _MOST)
+    return findings
 
 
 def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> list[Finding]:
@@ -107,8 +107,8 @@ def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[Finding]:
         yield Finding("numbers_not_used", "warning", text, where=topic)
 
 
-def _name_right(found: re.Match[str]) -> str:
-    word = found[0]
+def _name_right(match: re.Match[str]) -> str:
+    word = match[0]
     right = _RIGHT_OF[word.lower()]
     return right.upper() if word.isupper() else right.capitalize() if word[0].isupper() else right
 

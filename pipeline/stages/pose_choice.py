@@ -121,13 +121,13 @@ def rate_poses(
         ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
-    found = [_find_copy(one, ratings) for one in ratings]
-    best, of_best = found[0], _round_positions(found[0])
+    rated = [_find_copy(one, ratings) for one in ratings]
+    best, of_best = rated[0], _round_positions(rated[0])
     if not best.from_wheels:
-        for number, one in enumerate(found[1:], start=1):
+        for number, one in enumerate(rated[1:], start=1):
             if len(of_best & _round_positions(one)) > _COPIED * max(len(of_best), 1):
-                found[number] = replace(one, same_as=str(best.source))
-    return tuple(replace(one, position=None) for one in found)
+                rated[number] = replace(one, same_as=str(best.source))
+    return tuple(replace(one, position=None) for one in rated)
 
 
 _COPIED: Final = 0.9
