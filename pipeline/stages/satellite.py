@@ -272,7 +272,8 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
     share = float(np.mean(~np.isfinite(yaw)))
     text = (
         f"the heading of {topic} is its course over ground, since no IMU that turns with it was "
-        "recorded or agrees: lateral slip is not observable and reads zero"
+        f"recorded or agrees: lateral slip is not observable and reads zero, and turns are smoothed over "
+        f"{_WINDOW_S:g} s, which makes those that change faster look smaller"
     )
     if share:
         text += (
