@@ -37,7 +37,7 @@ _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
     "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
     "command": {
         "late_s": "late_s = 0",
-        "unit": 'unit = "rad/s"',
+        "unit": 'unit = "m/s"',
         "yaw_unit": 'yaw_unit = "rad/s"',
         "steering_unit": 'steering_unit = "rad"',
     },
@@ -244,9 +244,24 @@ class Case:
     # What the user reads, and what the stages read.
 
     def correct(
-        self, section: str, what: str, line: str, change: dict[str, object], margin: float | None = None
+        self,
+        section: str,
+        what: str,
+        line: str,
+        change: dict[str, object],
+        margin: float | None = None,
+        usual: str = "",
     ) -> None:
-        """Apply a correction, or tell it where the user's configuration decides otherwise."""
+        """Apply a correction, or tell it where the user's configuration decides otherwise.
+
+        Args:
+            section: of the configuration.
+            what: is wrong.
+            line: of run.toml that corrects it.
+            change: keys with their values.
+            margin: Vuong's statistic of the correction.
+            usual: unit that takes speeds as they are recorded.
+        """
         default = type(getattr(self.configuration, section))()
         given = [
             key
@@ -265,9 +280,7 @@ class Case:
             self.findings.append(Finding("signs_contradict", "error", text, where=section))
             return
         self.changes.setdefault(section, {}).update(change)
-        as_recorded = {**_AS_RECORDED[section]}
-        if section == "command" and change.get("unit") in SPEEDS and change["unit"] != "m/s":
-            as_recorded["unit"] = 'unit = "m/s"'
+        as_recorded = {**_AS_RECORDED[section]} | ({"unit": f'unit = "{usual}"'} if usual else {})
         settled = [text for key, text in as_recorded.items() if key in change]
         otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
         text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"

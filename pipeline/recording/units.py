@@ -145,7 +145,7 @@ def _find_side_unit(case: Case, command: Candidate, wheels: Candidate | None) ->
     if wheels is not None and wheels.reading.form == "sides" and driven is not None:
         if unit is not None and abs(np.log(abs(float(driven.ahead.gains[0])))) < np.log(_ALIKE):
             what = f"the wheel speeds of {command.source} are in {unit}, as those that are measured"
-            case.correct("command", what, f'unit = "{unit}"', {"unit": unit})
+            case.correct("command", what, f'unit = "{unit}"', {"unit": unit}, usual="rad/s")
     elif wheels is None and command.reading.explained is not None and command.sign("ahead"):
         explained = command.reading.explained
         radius = case.vehicle.wheel_radius_m if case.is_known else None
@@ -188,7 +188,7 @@ def _report_units(
             is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
             unsure = ", or has no unit, as percent of a throttle, whose gains say nothing of the robot"
             text = f"{of} is in {unit}{'' if is_sure else unsure}"
-            case.correct(role, text, f'{key} = "{unit}"', {key: unit})
+            case.correct(role, text, f'{key} = "{unit}"', {key: unit}, usual="m/s")
         elif units.rival is not None and units.rival[index] != unit:
             other, gain = units.rival[index], gains[index]
             seen = "" if gain is None else f": the body moves {gain:.3g} times as far as it says"
@@ -234,7 +234,7 @@ def correct_wheel_unit(
         case.correct(role, what, f"scale = {scale:g}", {"scale": scale})
     elif unit != "rad/s":
         what += f"{unit}{taken if unit in RIMS else ''}"
-        case.correct(role, what, f'unit = "{unit}"', {"unit": unit})
+        case.correct(role, what, f'unit = "{unit}"', {"unit": unit}, usual="rad/s")
 
 
 def _is_usable(drive: Candidate) -> bool:

@@ -225,6 +225,7 @@ LOCALIZED = re.compile(
 )
 FILTERED = re.compile(r"(?<!un)filter|ekf|ukf|fused|merged|combined")
 _OF_WHEELS = re.compile(r"wheel|unfiltered|controller|raw")
+_BY_WHEELS = re.compile(r"wheel|encoder")
 _RECEIVED = re.compile(r"controller|mux/cmd|cmd_vel_out|platform/cmd|drive/cmd|base/cmd|vehicle/")
 _UPSTREAM = re.compile(
     r"joy|teleop|nav|web|key|interactive|marker|plan|raw|key_vel|smoothed|manual|autonomous|safe|unsmoothed"
@@ -306,6 +307,8 @@ class Topics:
             role = drive.role
             if role == "either":
                 role = "wheels" if MEASURED.search(name) else "command"
+            if role == "command" and drive.form == "body" and not is_command and _BY_WHEELS.search(name):
+                role = "wheels"
             if (role == "command") != commanded:
                 continue
             is_derived = LOCALIZED.search(name) or FILTERED.search(name)

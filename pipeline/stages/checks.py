@@ -120,7 +120,8 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     text = (
         f"the vehicle covers {format_share(gain)} of the distance that wheels with a radius of {radius:.3g} "
         f"m roll: if the radius is {radius * gain:.3g} m, give --wheel-radius {radius * gain:.3g} or another "
-        f"--vehicle (in the controller: a wheel radius multiplier of {gain:.2g})"
+        f"--vehicle (in the controller: a wheel radius multiplier of {gain:.2g}); or the positions have no "
+        "scale, as those of a single camera"
     )
     return [Finding(WRONG_RADIUS, "error", text, where="wheels", value=radius * gain)]
 

@@ -163,6 +163,15 @@ def test_a_twist_with_covariance_that_is_named_after_wheels_measures_them(tmp_pa
     assert str(setup.sources.wheels) == "/wheel_twist"
 
 
+def test_a_twist_that_is_named_after_wheels_is_no_command(tmp_path: Path) -> None:
+    robot = Robot()
+    left, right = RADIUS * robot.wheels.T
+    fields = {"twist.linear.x": 0.5 * (left + right), "twist.angular.z": (right - left) / TRACK}
+    twist = record_cdr(robot.does, "/wheel/twist", TWIST, stamp_ros(robot.does) | fields)
+    setup = set_up(tmp_path, robot.command(), twist, robot.pose())
+    assert (str(setup.sources.command), str(setup.sources.wheels)) == ("/cmd_vel", "/wheel/twist")
+
+
 def record_own(robot: Robot, topic: str, kind: str, fields: Mapping[str, Floats]) -> DrawnTopic:
     rows = zip(*(values.tolist() for values in fields.values()), strict=True)
     return record_json(robot.does, topic, kind, [dict(zip(fields, row, strict=True)) for row in rows])
