@@ -313,6 +313,14 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
     assert 0.0 < dead.low < 0.235 < dead.high
 
 
+def test_an_interval_holds_its_value_also_beside_the_bounds_of_its_search() -> None:
+    limit = Free("body_turn_limit", "limit", (), (0.259, 50.0), 0.01)
+    beside = Estimate(limit, 0.189, 0.001, 0.0005, at_bound=False, observable=True)
+    assert beside.interval == pytest.approx((0.188, 0.190))
+    within = Estimate(limit, 0.2595, 0.001, 0.0005, at_bound=False, observable=True)
+    assert within.interval == pytest.approx((0.259, 0.2605))
+
+
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
     low, high = astuple(expect_another_run(track, 1.8, 1.78, 1.83))
