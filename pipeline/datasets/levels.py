@@ -200,28 +200,6 @@ class Sample:
         weight = 1.0 / (between + 1.0 / total)
         return float(np.sum(weight * means) / weight.sum()), 1.0 / float(weight.sum())
 
-    def rate(self, between: float, run: float) -> tuple[float, Floats]:
-        """Minus twice the restricted log likelihood with a common mean, and its derivatives by variance."""
-        weight, means, total = self.weigh(run)
-        outer = 1.0 / (between + 1.0 / total)
-        rest = means - np.sum(outer * means) / outer.sum()
-        squares = np.sum(weight * (self.y - means[self.group]) ** 2) + np.sum(outer * rest**2)
-        volume = np.log1p(between * total).sum() - np.log(weight).sum() + np.log(outer.sum())
-        shrinkage = 1.0 / (1.0 + between * total)
-        pulled = weight * (self.y - means[self.group] + (shrinkage * rest)[self.group])
-        trace = np.sum(weight) - np.sum(between * (shrinkage[self.group] * weight**2))
-        trace -= np.sum((weight * shrinkage[self.group]) ** 2) / outer.sum()
-        slope = outer.sum() - np.sum(outer**2) / outer.sum() - np.sum((outer * rest) ** 2)
-        return float(squares + volume), np.array([slope, trace - np.sum(pulled**2)])
-
-    def rate_within(self, run: float) -> tuple[float, Floats]:
-        """The same with a mean for each group: only the scatter within groups contributes."""
-        weight, means, total = self.weigh(run)
-        pulled = weight * (self.y - means[self.group])
-        value = self.add_within(run) - np.log(weight).sum() + np.log(total).sum()
-        trace = np.sum(weight - weight**2 / total[self.group])
-        return float(value), np.array([0.0, trace - np.sum(pulled**2)])
-
 
 def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
     """Maximum likelihood variances between groups and between runs, neither below zero.
@@ -239,12 +217,12 @@ def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
     if not free.any():
         return 0.0, 0.0
 
-    def look(spreads: Floats) -> tuple[float, Floats]:
-        group, run = ((scale * spreads * free) ** 2).tolist()
-        value, slopes = sample.rate(group, run) if common else sample.rate_within(run)
-        return value, slopes * 2.0 * scale**2 * spreads * free
+    def look(spreads: Floats) -> float:
+        wide, narrow = (scale * spreads * free)[:, None]
+        likelihood = rate_levels(sample, wide, narrow)[4] if common else rate_spreads(sample, narrow)[2]
+        return -2.0 * float(likelihood.item())
 
-    climbs = [minimize(look, start, jac=True, method="BFGS") for start in _STARTS]
+    climbs = [minimize(look, start, method="BFGS") for start in _STARTS]
     best = min(climbs, key=lambda one: float(one.fun))
     variances = (scale * np.asarray(best.x) * free) ** 2
     between, run = np.where(variances > _NONE * scale**2, variances, 0.0).tolist()
@@ -425,6 +403,23 @@ def rate_spreads(sample: Sample, narrow: Floats) -> tuple[Floats, Floats, Floats
     return total, means, -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
 
 
+def rate_levels(
+    sample: Sample, wide: Floats, narrow: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """As `rate_spreads`, with a common mean and its weight by both spreads, shape (m, k), before the last.
+
+    The restricted log likelihood is then that with a common mean, shape (m, k).
+    """
+    total, means, within = rate_spreads(sample, narrow)
+    # Axes: spread between groups, spread between runs, group.
+    outer = 1.0 / (wide[:, None, None] ** 2 + 1.0 / total)
+    mass = outer.sum(axis=2)
+    centre = (outer * means).sum(axis=2) / mass
+    away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
+    likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
+    return total, means, centre, mass, likelihood
+
+
 @dataclass(frozen=True)
 class _Spreads:
     """Posterior of the spreads on a grid, with the resulting means.
@@ -466,15 +461,8 @@ def _weigh_spreads(
         hint = "Give positive spreads."
         raise StatisticsError("bad_errors", f"usual spreads {usual} are not positive", hint=hint)
     wide, narrow = (size * _GRID for size in usual)
-    total, means, within = rate_spreads(sample, narrow)
-    # Axes: spread between groups, spread between runs, group.
-    outer = 1.0 / (wide[:, None, None] ** 2 + 1.0 / total)
-    mass = outer.sum(axis=2)
-    centre = (outer * means).sum(axis=2) / mass
-    away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
-    likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
-    score = likelihood + _PRIOR[:, None] + _PRIOR
-    return _Spreads(names, wide, narrow, total, means, centre, mass, score)
+    total, means, centre, mass, likelihood = rate_levels(sample, wide, narrow)
+    return _Spreads(names, wide, narrow, total, means, centre, mass, likelihood + _PRIOR[:, None] + _PRIOR)
 
 
 # Joint draws of many parameters in another run.
