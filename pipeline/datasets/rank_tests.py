@@ -214,25 +214,24 @@ def permute_means(a: ArrayLike, b: ArrayLike) -> float:
     return _Labellings.make(a, b).find_p(0.0)
 
 
-def bound_permuted(a: ArrayLike, b: ArrayLike, *, level: float = LEVEL) -> tuple[float, float] | None:
+def bound_permuted(a: ArrayLike, b: ArrayLike) -> tuple[float, float] | None:
     """Bounds of the difference b - a: the shifts of b that the permutation test does not reject.
 
-    They exclude zero exactly if the test's p is at most ``level``. Source: Good, Permutation, Parametric and
+    They exclude zero exactly if the test's p is at most `LEVEL`. Source: Good, Permutation, Parametric and
     Bootstrap Tests of Hypotheses (2005), section 3.2.
 
     Args:
         a: one value per unit, shape (n,).
         b: the same for the other side, shape (m,).
-        level: probability of bounds that miss the difference.
 
     Returns:
-        None if the units are too few for a p of ``level``: no shift can be rejected.
+        None if the units are too few for a p of `LEVEL`: no shift can be rejected.
 
     Raises:
         StatisticsError: a side is empty or contains a value that is not finite.
     """
     labellings = _Labellings.make(a, b)
-    low, high = (labellings.find_end(direction, level) for direction in (-1.0, 1.0))
+    low, high = (labellings.find_end(direction) for direction in (-1.0, 1.0))
     return None if low is None or high is None else (low, high)
 
 
@@ -302,28 +301,28 @@ class _Labellings:
         size = np.abs((self.values.sum() - shift * second - moved) / second - moved / first)
         return float(np.mean(size >= size[0] - TIE * float(size.max())))
 
-    def find_end(self, direction: float, level: float) -> float | None:
+    def find_end(self, direction: float) -> float | None:
         """The last shift in a direction from the observed one that is not rejected; None without an end."""
         first, _ = self.sizes
         inner = float(self.values[first:].mean() - self.values[:first].mean())
         extent = float(np.ptp(self.values))
-        if smallest_p(*self.sizes) > level:
+        if smallest_p(*self.sizes) > LEVEL:
             return None
         if extent == 0.0:
             return inner
         outer = inner + direction * extent
         # Zero is on the side of the interval on which its own test puts it.
         if direction * inner < 0.0:
-            inner, outer = (0.0, direction * extent) if self.find_p(0.0) > level else (inner, 0.0)
+            inner, outer = (0.0, direction * extent) if self.find_p(0.0) > LEVEL else (inner, 0.0)
         for _ in range(_DOUBLINGS):
-            if self.find_p(outer) <= level:
+            if self.find_p(outer) <= LEVEL:
                 break
             inner, outer = outer, outer + 2.0 * (outer - inner)
         else:
             return None
         for _ in range(_HALVINGS):
             middle = 0.5 * (inner + outer)
-            inner, outer = (middle, outer) if self.find_p(middle) > level else (inner, middle)
+            inner, outer = (middle, outer) if self.find_p(middle) > LEVEL else (inner, middle)
         return inner
 
 

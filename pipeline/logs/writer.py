@@ -231,11 +231,10 @@ class _Type(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Messages of one channel and one length: times [ns] and sequence numbers (n,), payloads (n, length)."""
+    """Messages of one channel and length: log times [ns], sequence numbers (n,), payloads (n, length)."""
 
     channel: int
     log_time: Ints
-    publish_time: Ints
     sequence: Ints
     payloads: NDArray[np.uint8]
 
@@ -298,7 +297,6 @@ class LogWriter:
         log_time: Ints,
         fields: Mapping[str, Given],
         *,
-        publish_time: Ints | None = None,
         header_time: Ints | None = None,
         definition: str | None = None,
     ) -> None:
@@ -309,7 +307,6 @@ class LogWriter:
             type_name: ``package/msg/Name``.
             log_time: [ns], int64, shape (n,), in any order.
             fields: values by leaf path (see ``normalize_columns``); absent fields are zero or empty.
-            publish_time: [ns]; the log times by default.
             header_time: stamps [ns] for ``header.stamp``, or for ``transforms[].header.stamp``.
             definition: ``ros2msg`` definition of a type that is not bundled.
 
@@ -317,13 +314,9 @@ class LogWriter:
             LogError: ``unknown_type``, ``field_not_found``, ``bad_column``.
         """
         log = np.asarray(log_time, dtype=np.int64).reshape(-1)
-        publish = log if publish_time is None else np.asarray(publish_time, dtype=np.int64).reshape(-1)
-        if publish.size != log.size:
-            what = f"{publish.size} publish times for {log.size} messages"
-            raise LogError("bad_column", what, where=topic, hint="Give one a message")
-        if log.size and min(log.min(), publish.min()) < 0:
+        if log.min(initial=0) < 0:
             hint = "Times are nanoseconds since 1970, zero or later"
-            raise LogError("bad_column", "a log or publish time lies before 1970", where=topic, hint=hint)
+            raise LogError("bad_column", "a log time lies before 1970", where=topic, hint=hint)
         kind = self._type(type_name, definition)
         given = dict(fields)
         if header_time is not None:
@@ -332,7 +325,7 @@ class LogWriter:
         first = self._sequences[channel]
         self._sequences[channel] += log.size
         for rows, payloads in encode_rows(kind.structure, log.size, given, where=topic):
-            self._waiting.append(_Rows(channel, log[rows], publish[rows], first + rows, payloads))
+            self._waiting.append(_Rows(channel, log[rows], first + rows, payloads))
 
     def write_before(self, log_time: int) -> None:
         """Write the messages logged before a time and free their memory.
@@ -367,13 +360,8 @@ class LogWriter:
         order = np.argsort(log, kind="stable")
         for number, row in zip(owner[order].tolist(), inside[order].tolist(), strict=True):
             rows = waiting[number]
-            self._mcap.add_message(
-                rows.channel,
-                int(rows.log_time[row]),
-                rows.payloads[row].tobytes(),
-                int(rows.publish_time[row]),
-                int(rows.sequence[row]),
-            )
+            time, payload = int(rows.log_time[row]), rows.payloads[row].tobytes()
+            self._mcap.add_message(rows.channel, time, payload, time, int(rows.sequence[row]))
 
     def discard(self) -> None:
         """Delete the unfinished file."""

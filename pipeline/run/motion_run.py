@@ -152,7 +152,6 @@ class MotionRun:
         alignment: corrections of the recording.
         repeats_s: period of the published poses [s] if they are repeated until the next one is computed; zero
             if each is new.
-        corrected_s: time between corrections of an odometry by its localization [s]; zero if unknown.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.
         is_drive_alone: whether its poses are the motion of its wheels, since none were recorded.
         origin: where its zero lies in the recording, see `anchored`.
@@ -171,7 +170,6 @@ class MotionRun:
     duration_s: float
     alignment: Alignment
     repeats_s: float = 0.0
-    corrected_s: float = 0.0
     is_on_course: bool = False
     is_drive_alone: bool = False
     origin: Origin = Origin()
@@ -318,7 +316,6 @@ def make_run(
         duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
         repeats_s=rigid.measure_repeats(tables["poses"]),
-        corrected_s=rigid.measure_period(_list_corrections(tables["poses"])),
         is_on_course=_has_finding(tables.get("findings"), "heading_from_course"),
         is_drive_alone=_has_finding(tables.get("findings"), GROUND_UNOBSERVABLE),
     )
@@ -326,11 +323,6 @@ def make_run(
 
 def _has_finding(findings: pl.DataFrame | None, name: str) -> bool:
     return findings is not None and not findings.is_empty() and name in findings["id"]
-
-
-def _list_corrections(poses: pl.DataFrame) -> Floats:
-    """Times at which a localization corrected the odometry that it continues [s]."""
-    return poses.filter("corrected")["t"].to_numpy() if "corrected" in poses.columns else np.zeros(0)
 
 
 _ALIGNED = (
