@@ -48,8 +48,7 @@ if TYPE_CHECKING:
     )
     from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
     from pipeline.datasets.features import gather_features, merge_features, read_features, write_features
-    from pipeline.datasets.forecast import FleetModel, Forecast, forecast_vehicle, join_evidence, list_held
-    from pipeline.datasets.levels import RunEvidence
+    from pipeline.datasets.forecast import FleetModel, Forecast, expect_values, forecast_vehicle, list_held
     from pipeline.datasets.pairs import (
         ABOUT_BLOCKS,
         ABOUT_UNIT,

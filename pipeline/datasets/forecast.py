@@ -11,8 +11,6 @@ import polars as pl
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Floats, format_count, format_interval
 from pipeline.datasets.levels import (
     LevelFit,
-    RunEvidence,
-    draw_joint_run,
     draw_run,
     find_outliers,
     split_levels,
@@ -331,15 +329,19 @@ class ForecastNumber:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """95 % interval."""
+        """95 % interval; it holds the expected value."""
         low, high = np.quantile(self.draws, _ENDS).tolist()
-        return low, high
+        return min(low, self.value), max(high, self.value)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the parameter's search."""
+        return find_effect(self.effect)().parameter(self.parameter).bounds
 
     @property
     def at_bound(self) -> bool:
         """Whether a search bound cuts the interval, so that its coverage is below 95 %."""
-        bounds = find_effect(self.effect)().parameter(self.parameter).bounds
-        return any(stands_at_bound(end, bounds) for end in self.ends)
+        return any(stands_at_bound(end, self.bounds) for end in self.ends)
 
     @property
     def has_default_spread(self) -> bool:
@@ -472,44 +474,19 @@ def forecast_vehicle(
     )
 
 
-def join_evidence(
-    start: Forecast, evidence: Sequence[RunEvidence], values: Mapping[str, float], *, seed: int = 0
-) -> Forecast:
-    """Forecast with parameters drawn jointly, from the normal equations of runs (`draw_joint_run`).
-
-    Every other draw remains that from single runs: fits to one run differ from a joint fit by more than the
-    equations imply (intervals of these alone contained 74 % of the parameters of Warthog runs).
+def expect_values(start: Forecast, values: Mapping[str, float]) -> Forecast:
+    """The forecast with the values of a fit to all runs as what is expected; its draws stay.
 
     Args:
         start: forecast from single runs.
-        evidence: normal equations of the runs in its order, near the values of a joint fit.
-        values: expected values from that fit on this terrain, by label; others are drawn about the median.
-        seed: seed of the draws.
+        values: values of that fit on this terrain, by label; other parameters are expected at their median.
     """
-    parameters = [find_effect(one.effect)().parameter(one.parameter) for one in start.numbers]
-    size = np.array([parameter.usual_size for parameter in parameters])
-    shared = np.array([parameter.level is Level.VEHICLE for parameter in parameters])
-    centre = np.array([values.get(number.label, number.value) for number in start.numbers])
-    drawn = draw_joint_run(
-        evidence,
-        start.terrain,
-        centre=centre,
-        usual=np.stack((size, RUNS_SHARE * size)),
-        size=size,
-        shared=shared,
-        count=DRAWS,
-        rng=np.random.default_rng([seed, len(evidence)]),
-    )
-    middle = np.median(drawn.run, axis=0)
-    fitted = np.array([number.label in values for number in start.numbers])
-    expected = np.where(fitted, centre, middle)
-    runs = drawn.run + expected - middle
-    numbers = []
-    for index, (number, parameter) in enumerate(zip(start.numbers, parameters, strict=True)):
-        draws = np.array(number.draws)
-        draws[::2] = np.clip(runs[::2, index], *parameter.bounds)
-        joint = min(max(float(expected[index]), parameter.bounds[0]), parameter.bounds[1])
-        numbers.append(replace(number, draws=draws, runs=drawn.runs_known[index], joint=joint))
+    numbers = [
+        replace(number, joint=float(np.clip(values[number.label], *number.bounds)))
+        if number.label in values
+        else number
+        for number in start.numbers
+    ]
     return replace(start, numbers=tuple(numbers))
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Flags, Floats, Ints, student_quantile
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Floats, Ints, student_quantile
 from pipeline.datasets.rank_tests import Interval, StatisticsError, check_values
 
 _NORMAL = 1e6
@@ -343,28 +343,6 @@ def draw_run(
     return Draws(own, own + grid.narrow[run] * rng.standard_normal(count))
 
 
-def draw_spreads(
-    values: ArrayLike,
-    errors: ArrayLike,
-    groups: Sequence[str],
-    *,
-    usual: tuple[float, float],
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Draw the spreads between groups and between runs of a group, each of shape (n,); as for `draw_run`.
-
-    Without values the spreads are drawn from their prior.
-    """
-    if not len(groups):
-        chance = np.exp(_PRIOR - _PRIOR.max())
-        picked = rng.choice(_GRID.size, (2, count), p=chance / chance.sum())
-        return usual[0] * _GRID[picked[0]], usual[1] * _GRID[picked[1]]
-    grid = _weigh_spreads(values, errors, groups, usual)
-    between, run = grid.pick(count, rng)
-    return grid.wide[between], grid.narrow[run]
-
-
 def weigh_run_spreads(
     values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: float
 ) -> tuple[Floats, Floats]:
@@ -463,141 +441,3 @@ def _weigh_spreads(
     wide, narrow = (size * _GRID for size in usual)
     total, means, centre, mass, likelihood = rate_levels(sample, wide, narrow)
     return _Spreads(names, wide, narrow, total, means, centre, mass, likelihood + _PRIOR[:, None] + _PRIOR)
-
-
-# Joint draws of many parameters in another run.
-#
-#     x_r = mu + a_g(r) + b_r,    a ~ N(0, diag(group spread^2)),  b ~ N(0, diag(run spread^2))
-#
-# The same model, per parameter. Each run contributes its normal equations, possibly singular: near its fit,
-# minus twice the log likelihood is x' N x - 2 h' x (Gelman and Hill, Data Analysis Using Regression, 2007,
-# chapter 13). Spreads are drawn per parameter from the estimates of single runs, weighted by their errors;
-# then all parameters jointly, given the spreads.
-
-_NARROWEST = 1e-4
-"""Zero spread in usual sizes; not exactly zero, so that its inverse is finite."""
-_VAGUE = 10.0
-"""Prior standard deviation of a parameter in usual sizes: keeps unidentified parameters finite."""
-
-
-@dataclass(frozen=True)
-class RunEvidence:
-    """Information of one run on p parameters.
-
-    Attributes:
-        run: name of the run.
-        group: label of its group.
-        normal: matrix N of its normal equations, shape (p, p): the inverse covariance where it exists.
-        pull: right side h, shape (p,): N times the parameters that fit the run best.
-    """
-
-    run: str
-    group: str
-    normal: Floats
-    pull: Floats
-
-
-@dataclass(frozen=True)
-class JointDraws:
-    """Joint draws of p parameters.
-
-    Attributes:
-        group: means of the group, shape (n, p).
-        run: parameters in another run of that group, shape (n, p).
-        odd: outlying runs by parameter, which are ignored for it.
-        runs_known: number of runs that determine each parameter, shape (p,).
-    """
-
-    group: Floats
-    run: Floats
-    odd: tuple[tuple[str, ...], ...]
-    runs_known: tuple[int, ...]
-
-
-def draw_joint_run(
-    runs: Sequence[RunEvidence],
-    group: str,
-    *,
-    centre: Floats,
-    usual: Floats,
-    size: Floats,
-    shared: Flags,
-    count: int,
-    rng: np.random.Generator,
-) -> JointDraws:
-    """Draw all parameters jointly as in another run of a group.
-
-    Args:
-        runs: information of each run, one or more.
-        group: group of the other run; may have no runs.
-        centre: centre of the draws of unidentified parameters, shape (p,).
-        usual: prior scales of the spreads between groups and between runs of a group, shape (2, p).
-        size: usual sizes of the parameters, shape (p,), positive.
-        shared: parameters that all groups have in common, shape (p,).
-        count: number of draws.
-        rng: random generator.
-    """
-    # In usual sizes, about the centre: parameters of different units share one matrix.
-    normals = np.array([size[:, None] * run.normal * size for run in runs])
-    pulls = np.array([size * (run.pull - run.normal @ centre) for run in runs])
-    groups = [run.group for run in runs]
-    vague = np.eye(size.size) / _VAGUE**2
-    single = np.linalg.inv(normals + vague)
-    values = (single @ pulls[:, :, None])[:, :, 0]
-    errors = np.sqrt(np.diagonal(single, axis1=1, axis2=2))
-    wide, narrow = np.empty((2, count, size.size))
-    odd: list[tuple[str, ...]] = []
-    runs_known: list[int] = []
-    free = np.zeros((len(runs), size.size), dtype=bool)
-    for column in range(size.size):
-        # A run that does not determine a parameter gives no information on its spread.
-        known = errors[:, column] < 0.5 * _VAGUE
-        labels = [""] * len(runs) if shared[column] else groups
-        rows = np.flatnonzero(known)
-        apart = rows[find_outliers(values[rows, column], errors[rows, column], [labels[row] for row in rows])]
-        free[apart, column] = True
-        bound_by = known & ~free[:, column]
-        odd.append(tuple(runs[which].run for which in apart))
-        runs_known.append(int(bound_by.sum()))
-        spreads = (float(one) / float(size[column]) for one in usual[:, column])
-        wide[:, column], narrow[:, column] = draw_spreads(
-            values[bound_by, column],
-            errors[bound_by, column],
-            [name for name, one in zip(labels, bound_by.tolist(), strict=True) if one],
-            usual=(next(spreads), next(spreads)),
-            count=count,
-            rng=rng,
-        )
-    wide[:, shared] = _NARROWEST
-    means, others = np.empty((2, count, size.size))
-    names = sorted(set(groups))
-    for draw in range(count):
-        between, within = wide[draw] ** 2, narrow[draw] ** 2
-        by_group = {name: (np.zeros_like(vague), np.zeros(size.size)) for name in names}
-        for normal, pull, name, loose in zip(normals, pulls, groups, free, strict=True):
-            weight, pulled = _widen(normal, pull, np.where(loose, _VAGUE**2, within))
-            by_group[name] = (by_group[name][0] + weight, by_group[name][1] + pulled)
-        upper = [_widen(weight, pulled, between) for weight, pulled in by_group.values()]
-        pulled_up = np.sum([h for _, h in upper], axis=0)
-        common = _draw_normal(vague + sum(one for one, _ in upper), pulled_up, rng)
-        own, pulled = by_group.get(group, (np.zeros_like(vague), np.zeros(size.size)))
-        sharp = np.diag(1.0 / between)
-        means[draw] = _draw_normal(own + sharp, pulled + common / between, rng)
-        others[draw] = means[draw] + narrow[draw] * rng.standard_normal(size.size)
-    return JointDraws(centre + size * means, centre + size * others, tuple(odd), tuple(runs_known))
-
-
-def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats]:
-    """Normal equations of the mean, if parameters scatter about it with these variances."""
-    factor = np.linalg.inv(np.eye(spread.size) + normal * spread)
-    weight: Floats = factor @ normal
-    pulled: Floats = factor @ pull
-    even: Floats = 0.5 * (weight + weight.T)
-    return even, pulled
-
-
-def _draw_normal(sharp: Floats, pull: Floats, rng: np.random.Generator) -> Floats:
-    """Draw from the normal distribution with this precision matrix and precision times mean."""
-    lower = np.linalg.cholesky(sharp)
-    mean = np.linalg.solve(sharp, pull)
-    return np.asarray(mean + np.linalg.solve(lower.T, rng.standard_normal(pull.size)), dtype=np.float64)

@@ -47,21 +47,6 @@ _ENOUGH = 0.01
 """Fall of chi-square below which a fit ends."""
 
 
-@dataclass(frozen=True)
-class RunNormal:
-    """Normal equations of one run for the free parameters of a joint fit (`datasets.levels.RunEvidence`).
-
-    Attributes:
-        labels: ``effect.name`` of the parameters.
-        normal: normal matrix for independent residuals of the run's own scale, shape (p, p).
-        pull: right side, shape (p,).
-    """
-
-    labels: tuple[str, ...]
-    normal: Floats
-    pull: Floats
-
-
 def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None) -> PartFit:
     """Fit the shared parameters of runs on one part of the path, from their current values, and run delays.
 
@@ -100,42 +85,6 @@ def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None
 def _sum_costs(part: Part, noise: Noise, residual: Floats, shares: Floats) -> float:
     """Cost of the innovations, each run by its share."""
     return float((list_costs(part, noise, residual) * shares[part.run]).sum())
-
-
-def list_ground_labels(state: State) -> list[str]:
-    """Labels of the parameters of a state with one value per ground."""
-    return [label for effect in state.effects for label in effect.ground_labels]
-
-
-def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
-    """Normal equations of each run of a fit, with parameters of single runs and delays eliminated.
-
-    For a ground parameter, a run contributes to the value of its own ground.
-    """
-    by_ground = list_ground_labels(fit.state)
-    excess, white = fit.overdispersion, fit.white
-    values = np.array([fit.state.get(number) for number in fit.free])
-    normals = []
-    for run in range(len(part.comparisons)):
-        common = [
-            index
-            for index, number in enumerate(fit.free)
-            if number.effect and (not number.runs or (run in number.runs and number.label in by_ground))
-        ]
-        rows = part.run[white.rows] == run
-        columns = white.columns[rows]
-        normal = columns.T @ columns / excess
-        pull = columns.T @ white.residual[rows] / excess + normal @ values
-        own = [n for n in range(len(fit.free)) if n not in common and fit.free[n].acts_in(run)]
-        shared = normal[np.ix_(common, own)] @ np.linalg.pinv(normal[np.ix_(own, own)])
-        normals.append(
-            RunNormal(
-                tuple(fit.free[index].label for index in common),
-                normal[np.ix_(common, common)] - shared @ normal[np.ix_(own, common)],
-                pull[common] - shared @ pull[own],
-            )
-        )
-    return normals
 
 
 def tie_to_prior(problem: Problem, numbers: Mapping[str, tuple[float, float]]) -> Problem:

@@ -1,4 +1,4 @@
-"""Plan of the next drive after stored runs, and the forecast from the evidence of each run.
+"""Plan of the next drive after stored runs, and the forecast from all runs of a vehicle.
 
 The plan answers open questions of their diagnosis; the forecast is of one model fitted jointly to all runs of
 a vehicle.
@@ -15,14 +15,13 @@ import numpy as np
 from pipeline.core import Floats, SlipError, format_count
 from pipeline.datasets import (
     Forecast,
-    RunEvidence,
+    expect_values,
     find_estimates,
     forecast_vehicle,
-    join_evidence,
     list_held,
 )
 from pipeline.estimation import Recording
-from pipeline.estimation.across_runs import fit_part_jointly, split_normals
+from pipeline.estimation.across_runs import fit_part_jointly
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
 from pipeline.estimation.fit import PartFit
@@ -61,9 +60,8 @@ def forecast_deployment(
 
     The stored models define the effects and the start values of the fit (`forecast_vehicle`). This model is
     fitted to all runs of the vehicle jointly, each weighted by its own misfit, with less weight for other
-    terrains. An effect that fewer models have is added if it lowers the misfit over all runs. The normal
-    equations of the single runs determine the variation of the parameters between terrains and runs
-    (`join_evidence`): a parameter that a run does not determine has no weight.
+    terrains. An effect that fewer models have is added if it lowers the misfit over all runs. How parameters
+    vary between terrains and runs is that of the single runs (`expect_values`).
 
     Args:
         store: the results.
@@ -100,7 +98,7 @@ def forecast_deployment(
         fits.append((part, fit))
     if also:
         start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
-    return join_evidence(start, _gather(problem, fits, start), read_values(problem, fits, terrain))
+    return expect_values(start, read_values(problem, fits, terrain))
 
 
 def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
@@ -128,23 +126,6 @@ def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) 
         if find_cost(extended) < find_cost(fit):
             fit = extended
     return fit
-
-
-def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forecast) -> list[RunEvidence]:
-    """Normal equations of every run for all parameters of a forecast, in its order."""
-    labels = [number.label for number in start.numbers]
-    size = len(labels)
-    normals, pulls = np.zeros((len(problem.runs), size, size)), np.zeros((len(problem.runs), size))
-    for part, fit in fits:
-        for run, summed in enumerate(split_normals(part, fit)):
-            rows = [index for index, label in enumerate(summed.labels) if label in labels]
-            places = [labels.index(summed.labels[row]) for row in rows]
-            normals[run][np.ix_(places, places)] += summed.normal[np.ix_(rows, rows)]
-            pulls[run][places] += summed.pull[rows]
-    return [
-        RunEvidence(run.name, run.terrain, normal, pull)
-        for run, normal, pull in zip(problem.runs, normals, pulls, strict=True)
-    ]
 
 
 def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain: str) -> Mapping[str, float]:

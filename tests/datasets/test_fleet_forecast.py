@@ -1,14 +1,10 @@
 """What the runs of a vehicle let expect of its numbers on a terrain."""
 
-from dataclasses import replace
-
-import numpy as np
 import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
-from pipeline.datasets.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
-from pipeline.datasets.levels import RunEvidence
+from pipeline.datasets.forecast import expect_values, fit_fleet, forecast_vehicle
 from pipeline.models.parameter import Level
 
 
@@ -97,27 +93,12 @@ def test_numbers_of_the_controller_are_the_vehicles_and_friction_is_the_grounds(
     assert (tau.level, tau.because) == (Level.VEHICLE, "by its nature the vehicle's")
 
 
-def test_runs_joined_by_their_equations_tell_what_none_of_them_tells() -> None:
-    """One run knows only the sum of two numbers, the other their difference, a third only the first."""
-    (lag,) = forecast_vehicle(
-        draw({"ice": 0.5}, effect="body_inertia", parameter="tau", runs=2), "warthog", "ice"
-    ).numbers
-    labels = (("lateral_skid", "c"), ("turning_resistance", "k"))
-    start = Forecast(
-        "warthog", "ice", "command",
-        tuple(replace(lag, effect=effect, parameter=name) for effect, name in labels),
-        (), (),
-    )  # fmt: skip
-    rows = [np.array([1.0, 1.0]), np.array([1.0, -1.0]), np.array([1.0, 0.0])]
-    truth = np.array([0.15, 0.05])
-    evidence = [
-        RunEvidence(f"r{place}", "ice", np.outer(row, row) / 0.002**2, row * float(row @ truth) / 0.002**2)
-        for place, row in enumerate(rows)
-    ]
-    joined = join_evidence(start, evidence, {})
-    assert [number.value for number in joined.numbers] == pytest.approx(truth.tolist(), abs=0.02)
-    apart = join_evidence(start, evidence[:1], {})
-    assert apart.numbers[1].deviation > 2.0 * joined.numbers[1].deviation
-    # What the fit to all runs found on this terrain is what is expected there.
-    fitted = join_evidence(start, evidence, {"lateral_skid.c": 0.18})
-    assert [number.value for number in fitted.numbers] == pytest.approx([0.18, 0.05], abs=0.02)
+def test_what_the_fit_to_all_runs_found_is_expected_within_what_runs_differ_by() -> None:
+    start = forecast_vehicle(draw({"ice": 0.9, "mud": 0.7}), "warthog", "ice")
+    (k,) = start.numbers
+    (fitted,) = expect_values(start, {k.label: k.ends[1] + 0.01}).numbers
+    assert fitted.value == pytest.approx(k.ends[1] + 0.01)
+    assert fitted.ends == (k.ends[0], fitted.value)
+    (bounded,) = expect_values(start, {k.label: 1e9}).numbers
+    assert bounded.value == k.bounds[1]
+    assert expect_values(start, {"drive_lag.tau": 1.0}) == start
