@@ -268,7 +268,7 @@ def play_drawn(fleets: int, seed: int) -> None:
                 for place, (name, mean) in enumerate(comes, start=2):
                     usual = (size, RUNS_SHARE * size)
                     drawn = draw_run(values, errors, terrains.tolist(), name, usual=usual, count=400, rng=rng)
-                    low, high = np.quantile(drawn.run, (0.025, 0.975))
+                    low, high = np.quantile(drawn, (0.025, 0.975))
                     asked[place] += 1
                     held[place] += bool(low <= mean + share * float(rng.normal()) <= high)
             rates = [told[level], told["open"], fleets - told[level] - told["open"]]
@@ -298,7 +298,7 @@ def play_few(fleets: int, seed: int) -> None:
                 drawn = draw_run(
                     values, errors, terrains, f"{which}", usual=(1.0, RUNS_SHARE), count=1000, rng=rng
                 )
-                low, high = np.quantile(drawn.run, (0.025, 0.975))
+                low, high = np.quantile(drawn, (0.025, 0.975))
                 held[number, place] = low <= means[which] + run * rng.normal() <= high
                 widths[number, place] = high - low
         (there, elsewhere), (wide, wider) = held.mean(axis=0), np.median(widths, axis=0)

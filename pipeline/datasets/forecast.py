@@ -465,7 +465,7 @@ def forecast_vehicle(
                 count=DRAWS,
                 rng=np.random.default_rng([seed, *f"{effect.id}.{parameter.name}".encode()]),
             )
-            draws = np.clip(drawn.run, *parameter.bounds)
+            draws = np.clip(drawn, *parameter.bounds)
             numbers.append(ForecastNumber(effect.id, parameter.name, parameter.unit, draws, own.height))
     names = set(rows["run"])
     there = set(here["run"])

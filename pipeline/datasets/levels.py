@@ -290,19 +290,6 @@ def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom:
 _GRID = np.geomspace(1e-3, 5.0, 48)
 
 
-@dataclass(frozen=True)
-class Draws:
-    """Draws of a parameter, each of shape (n,).
-
-    Attributes:
-        group: the mean of the group.
-        run: parameter in another run of that group.
-    """
-
-    group: Floats
-    run: Floats
-
-
 def draw_run(
     values: ArrayLike,
     errors: ArrayLike,
@@ -312,8 +299,8 @@ def draw_run(
     usual: tuple[float, float],
     count: int,
     rng: np.random.Generator,
-) -> Draws:
-    """Draw the parameter as in another run of a group.
+) -> Floats:
+    """Draw the parameter as in another run of a group, shape (count,).
 
     Args:
         values: one estimate per run, shape (n,), n >= 1.
@@ -328,19 +315,29 @@ def draw_run(
         StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error or
             a usual spread is not positive.
     """
-    grid = _weigh_spreads(values, errors, groups, usual)
-    between, run = grid.pick(count, rng)
-    total, means = grid.total, grid.means
-    common = grid.centre[between, run] + rng.standard_normal(count) / np.sqrt(grid.mass[between, run])
+    sample, names = make_sample(values, errors, groups)
+    if min(usual) <= 0.0:
+        hint = "Give positive spreads."
+        raise StatisticsError("bad_errors", f"usual spreads {usual} are not positive", hint=hint)
+    wide, narrow = (size * _GRID for size in usual)
+    total, means, centre, mass, likelihood = rate_levels(sample, wide, narrow)
+    score = likelihood + _PRIOR[:, None] + _PRIOR
+    chance = np.exp(score - score.max()).ravel()
+    between, run = np.unravel_index(rng.choice(chance.size, count, p=chance / chance.sum()), score.shape)
+    common = centre[between, run] + rng.standard_normal(count) / np.sqrt(mass[between, run])
     known = np.zeros(count)
     pull = np.zeros(count)
-    if group in grid.names:
-        index = grid.names.index(group)
-        known = total[run, index]
-        pull = known * means[run, index]
-    sharp = known + 1.0 / grid.wide[between] ** 2
-    own = (pull + common / grid.wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
-    return Draws(own, own + grid.narrow[run] * rng.standard_normal(count))
+    if group in names:
+        known = total[run, names.index(group)]
+        pull = known * means[run, names.index(group)]
+    sharp = known + 1.0 / wide[between] ** 2
+    own = (pull + common / wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
+    drawn: Floats = own + narrow[run] * rng.standard_normal(count)
+    return drawn
+
+
+# On a geometric grid a density is weighted by the spread.
+_PRIOR = np.log(_GRID) - 0.5 * _GRID**2
 
 
 def weigh_run_spreads(
@@ -396,48 +393,3 @@ def rate_levels(
     away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
     likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
     return total, means, centre, mass, likelihood
-
-
-@dataclass(frozen=True)
-class _Spreads:
-    """Posterior of the spreads on a grid, with the resulting means.
-
-    Attributes:
-        names: names of the groups.
-        wide, narrow: spreads between groups and between runs, shape (k,).
-        total, means: weight and mean of each group by spread between runs, shape (k, g).
-        centre, mass: common mean and its weight by both spreads, shape (k, k).
-        score: logarithm of the likelihood times the prior, shape (k, k).
-    """
-
-    names: list[str]
-    wide: Floats
-    narrow: Floats
-    total: Floats
-    means: Floats
-    centre: Floats
-    mass: Floats
-    score: Floats
-
-    def pick(self, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-        """Grid indices of drawn spreads, between groups and between runs."""
-        chance = np.exp(self.score - self.score.max()).ravel()
-        picked = rng.choice(chance.size, count, p=chance / chance.sum())
-        between, run = np.unravel_index(picked, self.score.shape)
-        return between, run
-
-
-# On a geometric grid a density is weighted by the spread.
-_PRIOR = np.log(_GRID) - 0.5 * _GRID**2
-
-
-def _weigh_spreads(
-    values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: tuple[float, float]
-) -> _Spreads:
-    sample, names = make_sample(values, errors, groups)
-    if min(usual) <= 0.0:
-        hint = "Give positive spreads."
-        raise StatisticsError("bad_errors", f"usual spreads {usual} are not positive", hint=hint)
-    wide, narrow = (size * _GRID for size in usual)
-    total, means, centre, mass, likelihood = rate_levels(sample, wide, narrow)
-    return _Spreads(names, wide, narrow, total, means, centre, mass, likelihood + _PRIOR[:, None] + _PRIOR)

@@ -310,12 +310,12 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     sizes = draw_run(
         logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,
         usual=_USUAL_LOG_RATIOS, count=DRAWS, rng=rng,
-    ).run  # fmt: skip
+    )  # fmt: skip
     there = np.array([name == forecast.terrain for name in terrains])
     comes = draw_run(
         paces, np.full(len(runs), _SMALL), terrains, forecast.terrain,
         usual=_USUAL_LOG_RATIOS, count=DRAWS, rng=rng,
-    ).run  # fmt: skip
+    )  # fmt: skip
     choices = rng.choice(len(runs), DRAWS, p=weigh_runs(there)).tolist()
     numbers: Floats = np.empty((DRAWS, 3))
     known = [_predict(run, forecast.effects) for run in runs]

@@ -19,7 +19,7 @@ def draw(values: list[float], groups: list[str], group: str, *, size: float = 1.
         count=2000,
         rng=np.random.default_rng(3),
     )
-    low, high = np.quantile(drawn.run, (0.025, 0.975)).tolist()
+    low, high = np.quantile(drawn, (0.025, 0.975)).tolist()
     return low, high
 
 
@@ -33,7 +33,7 @@ def test_intervals_hold_a_run_that_comes(spread: float, least: float, most: floa
         errors = rng.uniform(0.3, 0.6, len(groups))
         values = np.array([shift[name] for name in groups])
         values += np.hypot(0.5, errors) * rng.normal(size=len(groups))
-        drawn = draw_run(values, errors, groups, "ice", usual=(1.0, 1.0), count=500, rng=rng).run
+        drawn = draw_run(values, errors, groups, "ice", usual=(1.0, 1.0), count=500, rng=rng)
         low, high = np.quantile(drawn, (0.025, 0.975))
         held.append(low <= shift["ice"] + 0.5 * rng.normal() <= high)
     assert least <= np.mean(held) <= most
