@@ -153,6 +153,8 @@ class Case:
         self.moves_sideways = given.may_move_sideways(self.sources)
         self.driven: Explained | None = None
         self.timeout: CommandTimeout | None = None
+        # Whether what is commanded has a unit, so that the controller's lengths can be told from it.
+        self.is_scaled = True
 
     def leave_out(self, source: DriveSource) -> None:
         """Take a candidate for no role."""

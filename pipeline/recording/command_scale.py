@@ -217,6 +217,23 @@ def _find_median(asked: Floats, got: Floats) -> float | None:
     return float(np.median(got[slow] / asked[slow])) if slow.sum() >= FEWEST_STEPS else None
 
 
+def _take_as_followed(case: Case, command: Candidate, alignment: Alignment) -> Alignment:
+    """Scales of a body command without a unit, with which the body moves as far as it says."""
+    explained = command.reading.explained
+    assert explained is not None  # noqa: S101 - asked before
+    fits = (explained.ahead, explained.turned)
+    scales = [abs(float(one.gains[0])) / of for one, of in zip(fits, case.command_factors(), strict=True)]
+    seen = [command.sign("ahead") != 0, command.sign("turned") != 0]
+    ahead, turn = (scale if known else 1.0 for scale, known in zip(scales, seen, strict=True))
+    text = (
+        f"the numbers of {command.source} have no sure unit: as they are read, they are multiplied by "
+        f"{ahead:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
+        "of the drive and the ground are not known from them"
+    )
+    case.findings.append(Finding("command_scale", "warning", text, where="command", value=ahead))
+    return replace(alignment, command_scale=ahead, command_turn_scale=turn)
+
+
 def measure_command(
     case: Case, command: Candidate | None, wheels: Candidate | None, kind: str, motion: Motion | None
 ) -> Alignment | None:
@@ -256,6 +273,8 @@ def measure_command(
     rates = motion.rates if got.is_empty() and motion is not None else None
     if rates is None and not got.is_empty():
         rates = roll(got, vehicle)
+    if is_body and not case.is_scaled and command.reading.explained is not None:
+        alignment = _take_as_followed(case, command, alignment)
     # Stops that were asked for tell it best, where there are any.
     timeout = None if rates is None else find_timeout(*rates, asked, vehicle)
     timeout = timeout or case.timeout

@@ -268,6 +268,7 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
         and wheels.reading.form == "sides"
         and command.reading.form == "body"
         and case.driven is not None
+        and case.is_scaled
     ):
         radius, track = measure_controller(case.driven)
         speed, rate = case.command_factors()

@@ -23,9 +23,11 @@ from pipeline.recording.evidence import (
 )
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import Bent, Reading
-from pipeline.sources import DriveForm, PoseContent
+from pipeline.sources import DriveForm, PoseContent, plain_type
 from pipeline.stages import Finding
 
+JOYSTICK = "sensor_msgs/Joy"
+"""Type of axes, whose numbers from -1 to 1 have no unit."""
 _NEAR = 0.03
 """Spread of the logarithm of a gyro's scale."""
 
@@ -127,6 +129,10 @@ def find_units(case: Case, command: Candidate | None, wheels: Candidate | None) 
                 gain / abs(float(one.gains[0])) if gain and wheels.sign(axis) else gain  # type: ignore[arg-type]
                 for gain, (axis, one) in zip(gains, fits, strict=True)
             ]
+        columns = case.extraction.columns.get(command.source.signals[0].topic)
+        if columns is not None and plain_type(columns.type_name) == JOYSTICK:
+            case.is_scaled = False
+            return
         units = find_body_units(gains, explained.shares, str(command.source))
         _report_units(case, "command", command, units, gains)
     if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
@@ -186,6 +192,7 @@ def _report_units(
         if unit not in USUAL:
             speed, gain = units.likeliest[0], gains[0]
             is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
+            case.is_scaled = case.is_scaled and is_sure
             unsure = ", or has no unit, as percent of a throttle, whose gains say nothing of the robot"
             text = f"{of} is in {unit}{'' if is_sure else unsure}"
             case.correct(role, text, f'{key} = "{unit}"', {key: unit}, usual="m/s")

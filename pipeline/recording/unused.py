@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.logs import LogIndex, Ragged, Wanted, list_fields, read_topics
 from pipeline.recording.readings import SIDES
+from pipeline.recording.units import JOYSTICK
 from pipeline.sources import COMMANDED, MEASURED, MessageType, Sources, find_type, plain_type
 from pipeline.stages import Finding, Severity
 
@@ -28,7 +29,6 @@ _COMMANDED = re.compile(COMMANDED.pattern + "|pwm|duty|throttle")
 _SPEED = re.compile(r"^(speed|velocity|linear(_velocity|_speed|_x)?|forward(_speed)?|v|vx|v_x|throttle)$")
 _TURN = re.compile(r"^(yaw_?rate|turn_?rate|omega|angular(_velocity|_speed|_z)?|turn|w|wz|w_z)$")
 _STEER = re.compile(r"^(steering(_angle)?|steer|delta)$")
-_JOYSTICK = "sensor_msgs/Joy"
 _UNITS: Mapping[str, str] = {
     "tick|count|enc": '; unit = "ticks"; per_turn = 1000 (ticks of a whole turn)',
     "rpm": '; unit = "rpm"',
@@ -118,7 +118,7 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
     for topic, paths in unknown.items():
         if MEASURED.search(topic.lower()):
             continue
-        if plain_type(index.types[topic]) == _JOYSTICK:
+        if plain_type(index.types[topic]) == JOYSTICK:
             text = (
                 f"not used: {topic} (a joystick); if two of its axes are the command, in run.toml: "
                 f'[command] speed_topic = "{topic}.axes[1]"; yaw_rate_topic = "{topic}.axes[0]" (which axes, '

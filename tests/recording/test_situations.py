@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_motion import STEP, Drive, draw, sides
+from drawn_motion import GAIN, STEP, Drive, draw, sides
 from written_logs import write_log
 
 from pipeline.analysis import Options
@@ -169,8 +169,16 @@ def test_a_situation_is_told_and_corrected(
 def test_of_commands_in_percent_no_unit_is_sure(tmp_path: Path) -> None:
     drive = draw(54)
     log = write_log(tmp_path / "log.mcap", drive, asked=drive.asked * [125.0, 140.0])
-    told = [one.text for one in set_up_log(log, Options(out=tmp_path)).choice.findings]
+    setup = set_up_log(log, Options(out=tmp_path))
+    told = [one.text for one in setup.choice.findings]
     assert any("or has no unit, as percent of a throttle" in text for text in told)
+    # Lengths are of the motion, and no gain of the drive is made of such numbers.
+    assert setup.vehicle.wheel_radius_m == pytest.approx(0.1, rel=0.03)
+    scales = np.array([setup.alignment.command_scale, setup.alignment.command_turn_scale])
+    units = setup.configuration.command
+    factors = {"cm/s": 0.01, "mm/s": 1e-3, "deg/s": np.pi / 180.0}
+    by_unit = [factors[str(units.unit)], factors[str(units.yaw_unit)]]
+    np.testing.assert_allclose(scales * by_unit, [1.0 / 125.0, GAIN / 140.0], rtol=0.03)
 
 
 def test_a_car_that_takes_a_twist_for_a_steering_angle_is_read_so(tmp_path: Path) -> None:

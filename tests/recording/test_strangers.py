@@ -15,7 +15,7 @@ from drawn_drives import (
     stamp_ros,
     write_drawn,
 )
-from drawn_motion import RADIUS, TRACK, draw
+from drawn_motion import GAIN, RADIUS, TRACK, draw
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -273,3 +273,15 @@ def follow(values: Floats, lag: float) -> Floats:
         made[row] = state
         state += 0.05 / lag * (value - state)
     return made
+
+
+def test_of_a_joystick_no_gain_is_told(tmp_path: Path) -> None:
+    robot = Robot()
+    axes = np.column_stack([robot.asked.turn, robot.asked.speed / 0.8])
+    joystick = record_cdr(robot.asked, "/joy", "sensor_msgs/msg/Joy", {"axes": axes}, "float32[] axes")
+    lines = '[command]\nspeed_topic = "/joy.axes[1]"\nyaw_rate_topic = "/joy.axes[0]"'
+    (tmp_path / "run.toml").write_text(lines, encoding="utf-8")
+    setup = set_up(tmp_path, joystick, robot.base(), robot.pose())
+    scales = setup.alignment.command_scale, setup.alignment.command_turn_scale
+    assert scales == pytest.approx((0.8, GAIN), rel=0.03)
+    assert "have no sure unit" in told(setup)
