@@ -89,54 +89,38 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Size of the difference of two sides.
-
-    Attributes:
-        shift: Hodges-Lehmann shift b - a, in the unit of the values.
-        interval: the differences that the test does not reject; None where it can reject none.
-        delta: Cliff's delta of the units, above zero if b is larger.
-    """
-
-    shift: float
-    interval: Interval | None
-    delta: float
-
-
-@dataclass(frozen=True)
-class Ratio:
-    """Geometric mean of the units of b over that of a, with its 95 % interval if the spread is known."""
-
-    value: float
-    low: float | None
-    high: float | None
-
-
-@dataclass(frozen=True)
 class Pair:
-    """Comparison of two groups; what is not known is None.
+    """Comparison of two groups, as a row of the table `comparisons`; what is not known is None.
 
     Attributes:
-        a: first group.
-        b: second group.
-        comparison: shift, interval and effect size; None without a number.
-        ratio: ratio of b to a; None if a value is not positive.
+        a, b: the groups.
+        shift: Hodges-Lehmann shift b - a, in the unit of the values; None without a number.
+        low, high: ends of the differences that the test does not reject; None where it can reject none.
+        cliffs_delta: Cliff's delta of the units, above zero if b is larger; `size` is it in a word.
+        ratio: geometric mean of the units of b over that of a; None if a value is not positive.
+        ratio_low, ratio_high: its 95 % interval; None where no spread is known.
         p: p of the pair alone.
         p_adjusted: p corrected over the family of pairs.
-        smallest_p: smallest corrected p possible with these counts, whatever the difference.
+        smallest_p: smallest p possible with these counts, whatever the difference.
         unit: `RUNS` or `BLOCKS`.
         method: test and correction in words.
         spread: standard deviation of the logarithm between runs of a group, pooled over the groups.
         freedom: its degrees of freedom.
         p_uncorrected: plain Mann-Whitney over all samples; not valid.
         note: remark on the interpretation; may be empty.
-        overlap: driving in common, for a comparison at equal driving.
+        bins, overlap: driving in common, for a comparison at equal driving: see `Overlap`.
     """
 
     a: Group
     b: Group
-    comparison: Comparison | None = None
-    ratio: Ratio | None = None
+    shift: float | None = None
+    low: float | None = None
+    high: float | None = None
+    cliffs_delta: float | None = None
+    size: str = ""
+    ratio: float | None = None
+    ratio_low: float | None = None
+    ratio_high: float | None = None
     p: float | None = None
     p_adjusted: float | None = None
     smallest_p: float | None = None
@@ -146,12 +130,8 @@ class Pair:
     freedom: int | None = None
     p_uncorrected: float | None = None
     note: str = ""
-    overlap: Overlap | None = None
-
-    @property
-    def size(self) -> str:
-        """Cliff's delta in a word; empty without a number."""
-        return name_delta(self.comparison.delta) if self.comparison else ""
+    bins: int | None = None
+    overlap: float | None = None
 
 
 def compare_groups(
@@ -210,53 +190,42 @@ def _compare_family(
     compared = []
     for i, j in pairs:
         a, b = groups[i], groups[j]
-        overlap = None if overlaps is None else overlaps[frozenset((a.name, b.name))]
-        pair = Pair(a, b, unit=unit, overlap=overlap)
+        pair = Pair(a, b, unit=unit)
+        if overlaps is not None:
+            shared = overlaps[frozenset((a.name, b.name))]
+            pair = replace(pair, bins=shared.bins, overlap=shared.share)
         if (i, j) not in known:
             compared.append(replace(pair, note=NOT_SHARED))
             continue
-        difference = differences.get((i, j))
-        interval = difference.interval if difference else None
-        log_ends = None if interval is None else (interval.low, interval.high)
-        low, high = (None, None) if log_ends is None else map(exponentiate, log_ends)
+        delta = cliffs_delta(values[i], values[j])
         pair = replace(
-            pair,
-            comparison=_measure_shift(
-                (values[i], values[j]), (units[i], units[j]), interval, positive=positive
-            ),
-            ratio=Ratio(exponentiate(float(units[j].mean() - units[i].mean())), low, high)
-            if positive
-            else None,
-            p_uncorrected=_ask_published(a, b) if a.runs and b.runs else None,
+            pair, shift=shift_between(values[i], values[j]), cliffs_delta=delta, size=name_delta(delta)
         )
+        if positive:
+            pair = replace(pair, ratio=exponentiate(float(units[j].mean() - units[i].mean())))
+        if a.runs and b.runs:
+            pair = replace(pair, p_uncorrected=_ask_published(a, b))
+        difference = differences.get((i, j))
         if test is None or difference is None:
             compared.append(replace(pair, note=NO_SPREAD if unit == RUNS else TOO_SHORT))
             continue
+        if (ends := difference.interval) is not None:
+            pair = _bound_pair(pair, units[i], units[j], ends, positive=positive)
+        if unit == RUNS:
+            pair = replace(pair, spread=test.spread, freedom=test.freedom)
         notes = [*([ABOUT_BLOCKS] * (unit == BLOCKS)), *_note_scatter(values[i], values[j])]
-        spread = (test.spread, test.freedom) if unit == RUNS else (None, None)
-        compared.append(
-            replace(
-                pair,
-                method=test.method,
-                spread=spread[0],
-                freedom=spread[1],
-                note="; ".join(notes),
-                p=difference.p,
-                p_adjusted=difference.p_adjusted,
-                smallest_p=difference.smallest_p,
-            )
-        )
+        numbers = pick(difference, "p", "p_adjusted", "smallest_p")
+        compared.append(replace(pair, method=test.method, note="; ".join(notes), **numbers))
     return compared
 
 
-def _measure_shift(
-    values: tuple[Floats, Floats], units: tuple[Floats, Floats], ends: Interval | None, *, positive: bool
-) -> Comparison:
-    """Shift and effect size of two groups; the interval is one of the mean of logarithms if positive."""
-    interval = ends
-    if ends is not None and positive:
-        interval = Interval(*(_spread_ratio(*units, end) for end in (ends.low, ends.high)))
-    return Comparison(shift_between(*values), interval, cliffs_delta(*values))
+def _bound_pair(pair: Pair, a: Floats, b: Floats, ends: Interval, *, positive: bool) -> Pair:
+    """The pair with its intervals, whose ends are those of the mean of logarithms if all are positive."""
+    if not positive:
+        return replace(pair, low=ends.low, high=ends.high)
+    low, high = (_spread_ratio(a, b, end) for end in (ends.low, ends.high))
+    least, most = exponentiate(ends.low), exponentiate(ends.high)
+    return replace(pair, low=low, high=high, ratio_low=least, ratio_high=most)
 
 
 def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
@@ -300,10 +269,8 @@ def tabulate_pairs(
             "b": pair.b.name,
             "runs_a": pair.a.values.size,
             "runs_b": pair.b.values.size,
-            **_tabulate_numbers(pair),
             "unit_of_analysis": pair.unit,
-            **pick(pair, "size", "p", "p_adjusted", "smallest_p", "method", "p_uncorrected", "note"),
-            **pick(pair, "spread", "freedom"),
+            **pick(pair, *_COLUMNS),
             "keys": f"{keys[pair.a.name]} {keys[pair.b.name]}",
         }
         for pair in pairs
@@ -313,16 +280,11 @@ def tabulate_pairs(
     return frame.select(cs.string(), cs.float(), cs.integer(), cs.enum())
 
 
-def _tabulate_numbers(pair: Pair) -> dict[str, float | None]:
-    numbers: dict[str, float | None] = {}
-    if pair.comparison:
-        numbers |= {"shift": pair.comparison.shift, "cliffs_delta": pair.comparison.delta}
-        numbers |= pick(pair.comparison.interval, "low", "high") if pair.comparison.interval else {}
-    if pair.ratio:
-        numbers |= {"ratio": pair.ratio.value, "ratio_low": pair.ratio.low, "ratio_high": pair.ratio.high}
-    if pair.overlap:
-        numbers |= {"bins": pair.overlap.bins, "overlap": pair.overlap.share}
-    return numbers
+_COLUMNS = (
+    "shift", "low", "high", "cliffs_delta", "size", "ratio", "ratio_low", "ratio_high", "p", "p_adjusted",
+    "smallest_p", "method", "spread", "freedom", "p_uncorrected", "note", "bins", "overlap",
+)  # fmt: skip
+"""Attributes of a `Pair` that are columns of the table."""
 
 
 DIFFERENT, OF_TWO_RUNS, ALIKE, UNTESTED = "different", "different runs", "alike", "untested"
