@@ -55,7 +55,7 @@ class Estimate:
         least, most = self.free.bounds
         if not 2.0 * self.half <= most - least:
             return math.nan, math.nan
-        # Bounds of a search, as those of a limit by measured wheels, can lie beside the value: they cut nothing.
+        # Bounds of a search, as those of a limit by measured wheels, can lie beside the value.
         bounds = self.free.bounds if least <= self.value <= most else (-math.inf, math.inf)
         return cut_interval(self.value - self.half, self.value + self.half, bounds)
 

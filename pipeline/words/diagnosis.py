@@ -390,7 +390,8 @@ def format_suggestion(rest: Unexplained) -> str:
     if rest.with_formula is None:
         return ""
     remaining = format_step(rest.with_formula)
-    return f"no model holds it until you add it (`slip serve`; in Python `model + diagnosis.suggestion`): {remaining} would remain over {HORIZON_S:g} s"
+    ways = "`slip serve`; in Python `model + diagnosis.suggestion`"
+    return f"no model holds it until you add it ({ways}): {remaining} would remain over {HORIZON_S:g} s"
 
 
 def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
