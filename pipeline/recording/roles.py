@@ -197,7 +197,8 @@ _HELD = 0.5
 def _is_no_command(one: Candidate) -> bool:
     """Whether a candidate for a command states the motion as it is, and changes as it does."""
     is_named = one.source.reason == CONFIGURED or COMMANDED.search(str(one.source).lower())
-    if one.is_measured or is_named or not any(equal_motion(one.reading)):
+    ahead, turned = equal_motion(one.reading)
+    if one.is_measured or is_named or not (turned if one.sign("turned") else ahead):
         return False
     return float(np.mean([each.held_share for each in one.reading.inputs])) < _HELD
 

@@ -467,7 +467,7 @@ def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
         Finding(
             "stamp_after_log_time",
             "warning",
-            f"the stamps of {clock.topic} lie {-clock.latency_s * 1e3:.0f} ms after they were recorded: "
+            f"the stamps of {clock.topic} lie {_format_offset(-clock.latency_s)} after they were recorded: "
             "its clock runs ahead",
             where=clock.topic,
             value=clock.latency_s,
@@ -485,7 +485,9 @@ def _join_time_bases(
     if not stamped:
         return clocks, []
     findings = []
-    home = float(np.median([clock.latency_s for clock in stamped.values()]))
+    latencies = sorted(clock.latency_s for clock in stamped.values())
+    # Of two clocks the one counts that is nearer to the recorder's.
+    home = min(latencies[(len(latencies) - 1) // 2], latencies[len(latencies) // 2], key=abs)
     joined = dict(clocks)
     for key, clock in clocks.items():
         away = clock.latency_s - home
@@ -510,7 +512,9 @@ def _join_time_bases(
 
 
 def _format_offset(seconds: float) -> str:
-    return f"{seconds:.3g} s" if abs(seconds) * 1e9 < DAY_NS else "more than a day (another epoch)"
+    if abs(seconds) * 1e9 > DAY_NS:
+        return "more than a day (another epoch)"
+    return format_duration(abs(seconds)) if abs(seconds) >= 1e3 else f"{seconds:.3g} s"  # noqa: PLR2004 - digits
 
 
 def drop_repeated_stamps(

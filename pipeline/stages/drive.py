@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core import Floats, Ints, spread_equal
+from pipeline.core import Flags, Floats, Ints, spread_equal
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import (
@@ -133,6 +133,19 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     moves = vehicle.kinematics.has_inputs("sideways")
     sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
     return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(findings))
+
+
+def is_of_wheels(columns: TopicColumns, drive: Drive) -> Flags:
+    """Messages that hold the joints of a drive, shape (n,): others of the topic may be of an arm."""
+    joints = find_type(columns.type_name).joints
+    names = None if joints is None else columns.fields[joints.names]
+    signals = [one for name in Drive.list_signals() if (one := getattr(drive, name)) is not None]
+    if not isinstance(names, RaggedStrings) or not signals:
+        return np.ones(columns.log_time.size, dtype=bool)
+    sizes = np.diff(names.offsets)
+    kinds = names.at(0).codes.astype(np.int64) * (1 + int(sizes.max(initial=0))) + sizes
+    read = np.any([np.isfinite(one) for one in signals], axis=0)
+    return np.isin(kinds, kinds[read])
 
 
 def _find_factor(section: DriveSection, side: str, joint: str = "") -> float:

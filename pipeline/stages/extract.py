@@ -33,6 +33,7 @@ from pipeline.stages.drive import (
     differentiate_angle,
     interpolate_readings,
     is_angle,
+    is_of_wheels,
     read_joints,
     read_pair,
     read_rates,
@@ -570,6 +571,7 @@ class Extraction:
         if source.form is DriveForm.JOINTS:
             columns, clock, order = self._require(source.signals[0].topic, held=held)
             drive = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
+            order = order[is_of_wheels(columns, drive)[order]]
             drive = drive.take(order)
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:

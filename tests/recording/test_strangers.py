@@ -104,6 +104,22 @@ def test_joints_of_an_arm_are_not_taken_for_the_wheels(names: list[str], tmp_pat
     assert setup.vehicle.wheel_radius_m == pytest.approx(RADIUS, rel=0.03)
 
 
+def test_messages_of_an_arm_in_the_topic_of_the_wheels_are_no_broken_wheels(tmp_path: Path) -> None:
+    robot = Robot()
+    names = ["left_arm_shoulder", "right_arm_shoulder"]
+    arm = robot.joints("/joint_states", names, np.column_stack([np.sin(robot.does.time), robot.does.time]))
+    base = robot.base()
+    mixed = replace(
+        base,
+        times=np.concatenate([base.times, arm.times + 7_000_000]),
+        messages=[*base.messages, *arm.messages],
+    )
+    log = write_drawn(tmp_path / "log.mcap", robot.command(), mixed, robot.pose())
+    made = analyze_log(log, Options(out=tmp_path / "results", report=False, diagnosis=False))
+    assert made.manifest.read("wheels").height == base.times.size
+    assert "break the contract" not in " ".join(made.manifest.read("findings")["text"].to_list())
+
+
 def test_of_two_bodies_the_one_that_is_driven_is_the_vehicle(tmp_path: Path) -> None:
     robot, person = Robot(), Robot(seed=72)
     poses = robot.pose("/mocap/robot/pose"), person.pose("/mocap/helmet/pose")
