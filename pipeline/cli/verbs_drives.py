@@ -13,6 +13,7 @@ from cyclopts.types import PositiveFloat
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
+    All,
     Choices,
     Results,
     build_options,
@@ -56,6 +57,7 @@ def plan(  # noqa: D417 - the runs document themselves
     config: Path | None = None,
     results: Results = Path("results"),
     folder: Path = Path("plan"),
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -78,6 +80,7 @@ def plan(  # noqa: D417 - the runs document themselves
         check: plan.toml, or the plan's folder, to compare with the log of the drive.
         config: configuration file of the logs.
         folder: folder of the plan, to write.
+        everything: also print what the drive does not answer, and what would.
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
@@ -127,7 +130,7 @@ def plan(  # noqa: D417 - the runs document themselves
         print_lines(
             [
                 *_format_known(studied.forecast),
-                *format_plan(made, driven_s, files, said, wanted or ()),
+                *format_plan(made, driven_s, files, said, wanted or (), everything=everything),
                 *shown,
             ]
         )
@@ -253,8 +256,18 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     return LOSSY if lossy else CLEAN
 
 
+_GAINS = 5
+"""Rows of what a drive tells on a screen of 24 lines, in the order of the plan."""
+
+
 def format_plan(
-    made: Plan, driven_s: float, files: Sequence[Path], said: str = "", wanted: Sequence[str] = ()
+    made: Plan,
+    driven_s: float,
+    files: Sequence[Path],
+    said: str = "",
+    wanted: Sequence[str] = (),
+    *,
+    everything: bool = False,
 ) -> list[str]:
     """The plan on one screen.
 
@@ -264,6 +277,7 @@ def format_plan(
         files: the files that were written.
         said: flags that the next command needs again.
         wanted: ids of the effects that were asked for; all that is open without any.
+        everything: all rows of what is open; else the first that the drive tells of.
     """
     from pipeline.plan import SAFETY, list_gains, summarize_gains  # noqa: PLC0415 - heavy
 
@@ -273,8 +287,12 @@ def format_plan(
             return [f"open         nothing about {', '.join(wanted)}{runs}"]
         return [f"open         nothing{runs}: no cause is undecided, and each number is known well enough"]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-    rows = [("open", "so far", "with this drive"), *list_gains(made)]
-    lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in align_rows(rows))]
+    gains = list_gains(made)
+    shown = gains if everything or not made.manoeuvres else gains[:_GAINS]
+    rows = align_rows([("open", "so far", "with this drive"), *shown])
+    lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in rows)]
+    if len(shown) < len(gains):
+        lines.append("  the rest, and what would answer what this drive does not: --all, or the page")
     most = f"limits       {made.format_limits()}"
     if not made.manoeuvres:
         return [
