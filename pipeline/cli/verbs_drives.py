@@ -277,7 +277,7 @@ def format_plan(
         files: the files that were written.
         said: flags that the next command needs again.
         wanted: ids of the effects that were asked for; all that is open without any.
-        everything: all rows of what is open; else the first that the drive tells of.
+        everything: all open questions; else the first that the drive tells of.
     """
     from pipeline.plan import SAFETY, list_gains, summarize_gains  # noqa: PLC0415 - heavy
 
