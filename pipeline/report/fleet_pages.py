@@ -18,6 +18,7 @@ from pipeline.core import (
     mapping_in,
     number_in,
     objects_in,
+    split_interval,
     suffix_unit,
 )
 from pipeline.datasets import (
@@ -57,7 +58,7 @@ from pipeline.report import (
 )
 from pipeline.report.comparison_page import write_tables
 from pipeline.report.page import add_figures, render_figures
-from pipeline.report.scene import CAP_QUANTILE, format_ends
+from pipeline.report.scene import CAP_QUANTILE
 from pipeline.report.theme import (
     Chart,
     Drawing,
@@ -148,8 +149,7 @@ def _list(row: Mapping[str, object]) -> list[str | Cell]:
     return [
         Cell(_name(row), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
         str(row["level"] or "open"),
-        _format_value(row, row),
-        "" if row["low"] is None else format_ends(row).replace(" ", "\u00a0"),
+        *_format_value(row, row),
         *spreads,
         f"{row['named']} of {row['runs']}",
     ]
@@ -162,17 +162,21 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
         [
             Cell(_name(row), small=_label(row)),
             name,
-            _format_value(mean, row),
-            format_ends(mean).replace(" ", "\u00a0"),
+            *_format_value(mean, row),
             str(mean["runs"]),
         ]
         for name, mean in means.items()
     ]
 
 
-def _format_value(of: Mapping[str, object], row: Mapping[str, object]) -> Cell:
+def _format_value(of: Mapping[str, object], row: Mapping[str, object]) -> tuple[Cell, str]:
+    """A value with its unit, and its interval; both with the digits that the interval supports."""
     unit = set_squares(suffix_unit(row["unit"]).strip())
-    return Cell(format_number(number_in(of, "value")), small=unit)
+    value, low, high = (number_in(of, key) for key in ("value", "low", "high"))
+    if value is None or low is None or high is None:
+        return Cell(format_number(value), small=unit), ""
+    texts = [text.replace("-", "\u2212") for text in split_interval(value, low, high)]
+    return Cell(texts[0], small=unit), f"{texts[1]}\u00a0to\u00a0{texts[2]}"
 
 
 MOST_MAPS = 12
