@@ -83,7 +83,12 @@ class Recording:
     def is_followed(self) -> bool:
         """Whether the pose follows what drives the vehicle, as far as the log tells."""
         known = [one for one in self.evidence if one.margin is not None and one.role != "gyro"]
-        return not known or any((one.margin or 0.0) > CLEAR for one in known)
+        return not known or self.margin > CLEAR
+
+    @property
+    def margin(self) -> float:
+        """Vuong's statistic of the pose with what drives the vehicle against the pose alone; zero of none."""
+        return max((one.margin or 0.0 for one in self.evidence if one.role != "gyro"), default=0.0)
 
 
 def examine(given: Given) -> Recording:

@@ -497,10 +497,10 @@ def _compare(
                 still = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
                 return replace(alone, findings=(*alone.findings, still))
     recording = examine(Given(data, sources, configuration, chosen.vehicle, where=str(index.path)))
-    for other in _list_equals(ratings) if not recording.is_followed else ():
+    for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
         made = examine(Given(data, instead, configuration, chosen.vehicle, where=str(index.path)))
-        if made.is_followed:
+        if made.is_followed and (made.margin > recording.margin or not recording.is_followed):
             text = (
                 f"{other.source} is taken for the pose, and not {ratings[0].source}: the vehicle moves as it "
                 "does; the other is of another body"
@@ -526,6 +526,15 @@ def _compare(
         extracted=extracted,
         recording=recording,
     )
+
+
+_ASTRAY = 0.2
+"""Share of a pose's path that the wheels do not explain, from which on it may be that of another body."""
+
+
+def _is_astray(ratings: Sequence[PoseRating]) -> bool:
+    beside = ratings[0].beside_wheels if ratings else None
+    return beside is not None and beside > _ASTRAY
 
 
 def _list_equals(ratings: Sequence[PoseRating]) -> list[PoseRating]:

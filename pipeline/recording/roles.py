@@ -73,10 +73,15 @@ def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
         velocity = np.interp(at, reading.first.times, reading.first.values) + 1j * np.interp(
             at, reading.third.times, reading.third.values
         )
-        velocity, heading = velocity[last >= 0], motion.middle[last >= 0]
+        velocity, headings = velocity[last >= 0], [motion.middle[last >= 0]]
+        if reading.second is not None and reading.second.moves:
+            # An odometry has a heading of its own.
+            turned = np.cumsum(reading.second.values[:-1] * np.diff(reading.second.times))
+            headings.append(np.interp(at[last >= 0], reading.second.times[1:], turned))
         power = max(float(np.sum(np.abs(velocity) ** 2)), 1e-12)
-        lines = [abs(np.sum(one**2)) / power for one in (velocity, velocity * np.exp(-1j * heading))]
-        if lines[0] < ONE_LINE < lines[1]:
+        turns = [1.0, *(np.exp(-1j * heading) for heading in headings)]
+        lines = [abs(np.sum((velocity * turn) ** 2)) / power for turn in turns]
+        if lines[0] < ONE_LINE < max(lines[1:]):
             text = (
                 f"not used: {source}: its velocities are along the axes of a map, and not ahead and to the "
                 "left of the body"
@@ -207,7 +212,11 @@ def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | N
     """Wheels by type and name, or others that the motion follows where it does not follow these."""
     source = case.sources.wheels
     wheels = _find(drives, source)
-    is_open = wheels is None or (not wheels.is_sure and not wheels.reading.dead_side)
+    made = None if wheels is None else wheels.reading.explained
+    # An encoder that dies is settled later: of that of the other side something is followed.
+    is_open = wheels is None or (
+        made is not None and max(abs(made.ahead.t[0]), abs(made.turned.t[0])) < CLEAR
+    )
     if source is None or source.reason == CONFIGURED or not is_open:
         return wheels
     others = [one for one in drives if one.is_measured and one.is_sure and one not in (wheels, command)]

@@ -11,7 +11,7 @@ from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps, compare
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, compare
 from pipeline.stages import CommandTimeout
 
 _PERIODS = 3.0
@@ -24,7 +24,9 @@ _AFTER_S = 2.0
 """The same after it [s]."""
 _DELAYS_S = np.arange(-0.1, 0.41, 0.1)
 """Delays that are tried [s]."""
-_TRIES = 12
+_STOPPED = 0.5
+"""Motion over what is asked in the second half of silences, over that of driving, of a drive that stops."""
+_TRIES = 6
 """Time-outs that are tried first, from the usual period to the longest silence."""
 _FINE_S = 0.02
 """Step between those that are tried last [s]."""
@@ -64,7 +66,7 @@ def find_by_silences(reading: Reading, motion: Motion) -> CommandTimeout | None:
         reading: the command.
         motion: of the wheels, or of the body.
     """
-    gaps, near = _find_silences(reading, motion.steps)
+    gaps, near = _find_silences(reading, motion)
     throughout = hold(reading, np.inf).explain(motion.take(near), _DELAYS_S) if gaps.size else None
     if throughout is None:
         return None
@@ -91,8 +93,12 @@ def find_by_silences(reading: Reading, motion: Motion) -> CommandTimeout | None:
     return CommandTimeout(best, low, high, int((gaps > best).sum())) if is_known else None
 
 
-def _find_silences(reading: Reading, steps: Steps) -> tuple[Floats, Flags]:
-    """Lengths of the silences in which something is asked [s], none of too few; and the steps near them."""
+def _find_silences(reading: Reading, motion: Motion) -> tuple[Floats, Flags]:
+    """Lengths of the silences in which something is asked [s], and the steps near them.
+
+    There are none of too few, or where the motion goes on as it was asked to before.
+    """
+    steps = motion.steps
     nothing = np.zeros(0), np.zeros(steps.start.size, dtype=bool)
     if not reading.inputs:
         return nothing
@@ -106,7 +112,15 @@ def _find_silences(reading: Reading, steps: Steps) -> tuple[Floats, Flags]:
     ends = np.minimum(times[silent + 1], times[silent] + _BEFORE_S) + _AFTER_S
     at = np.searchsorted(begins, steps.end, side="right") - 1
     near = (at >= 0) & (steps.end < ends[at])
-    return (gaps[silent], near) if near.sum() >= FEWEST_STEPS else nothing
+    if near.sum() < FEWEST_STEPS:
+        return nothing
+    asked_there = np.abs(np.column_stack(reading.columns(steps, 0.0, 0.0, crossed=False)))
+    moved = np.abs(np.column_stack([motion.body.real, motion.yaw]))
+    of = np.maximum(np.searchsorted(times[silent], steps.start, side="right") - 1, 0)
+    since = steps.start - times[silent][of]
+    late = (since > 0.5 * gaps[silent][of]) & (since + steps.end - steps.start < gaps[silent][of])
+    shares = [moved[rows].sum(axis=0) / (asked_there[rows].sum(axis=0) + 1e-9) for rows in (late, ~late)]
+    return (gaps[silent], near) if (shares[0] < _STOPPED * shares[1]).all() else nothing
 
 
 def _find_period(reading: Reading) -> float:

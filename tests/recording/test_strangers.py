@@ -128,6 +128,40 @@ def test_of_two_bodies_the_one_that_is_driven_is_the_vehicle(tmp_path: Path) -> 
     assert "is taken for the pose, and not /mocap/helmet/pose" in told(setup)
 
 
+def test_of_two_bodies_the_follower_is_not_the_vehicle(tmp_path: Path) -> None:
+    robot = Robot()
+    leader, behind = robot.pose("/mocap/leader/pose"), robot.pose("/mocap/follower/pose")
+    follower = replace(behind, times=behind.times + 1_500_000_000)
+    late = stamp_ros(replace(robot.does, time=robot.does.time + 1.5))
+    fields = late | robot.does.pose("pose.") | {"header.frame_id": "map"}
+    follower = replace(
+        follower, messages=record_cdr(robot.does, "/mocap/follower/pose", POSE, fields).messages
+    )
+    setup = set_up(tmp_path, robot.command(), robot.base(), leader, follower)
+    assert str(setup.sources.pose) == "/mocap/leader/pose"
+
+
+def test_an_odometry_whose_velocities_turn_with_its_own_heading_is_left_out(tmp_path: Path) -> None:
+    robot = Robot()
+    left, right = RADIUS * robot.wheels.T
+    speed, rate = 0.5 * (left + right), (right - left) / TRACK
+    yaw = np.cumsum(rate) * 0.1
+    twist = {"linear.x": speed * np.cos(yaw), "linear.y": speed * np.sin(yaw), "angular.z": rate}
+    fields = {f"twist.twist.{name}": values for name, values in twist.items()}
+    place = np.cumsum(speed * np.exp(1j * yaw)) * 0.1
+    frames = {
+        "header.frame_id": "odom",
+        "pose.pose.position.x": place.real,
+        "pose.pose.position.y": place.imag,
+    }
+    turned = {"pose.pose.orientation.z": np.sin(yaw / 2.0), "pose.pose.orientation.w": np.cos(yaw / 2.0)}
+    kind = "nav_msgs/msg/Odometry"
+    odometry = record_cdr(robot.does, "/odom", kind, stamp_ros(robot.does) | fields | frames | turned)
+    setup = set_up(tmp_path, robot.command(), odometry, robot.pose())
+    assert setup.sources.wheels is None
+    assert "not used: /odom: its velocities are along the axes of a map" in told(setup)
+
+
 def test_commanded_wheel_speeds_are_in_the_unit_of_those_that_follow(tmp_path: Path) -> None:
     robot = Robot()
     turn = 0.5 * TRACK * robot.asked.turn
