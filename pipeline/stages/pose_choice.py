@@ -122,9 +122,13 @@ def rate_poses(
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
     rated = [_find_copy(one, ratings) for one in ratings]
-    best, of_best = rated[0], _round_positions(rated[0])
-    if not best.from_wheels:
-        for number, one in enumerate(rated[1:], start=1):
+    best, driven = (
+        rated[0],
+        {signal.topic for drive in sources.rank_drives("wheels") for signal in drive.signals},
+    )
+    for number, one in enumerate(rated[1:], start=1):
+        if not best.from_wheels and one.source.topic in driven:
+            of_best = _round_positions(best)
             if len(of_best & _round_positions(one)) > _COPIED * max(len(of_best), 1):
                 rated[number] = replace(one, same_as=str(best.source))
     return tuple(replace(one, position=None) for one in rated)
