@@ -21,7 +21,7 @@ from pipeline.estimation.fit import PartFit, approach, fit_part
 from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.parts import HORIZONS_S
-from pipeline.estimation.plausibility import is_nameable, is_too_small
+from pipeline.estimation.plausibility import is_nameable, is_too_small, list_implausible
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -335,6 +335,12 @@ class Search:
             known = {one.id for one in self.candidates} - set(fit.ids)
             if simpler is not None and simpler.id in known:
                 return self._reduce(self.fit(fit.state.drop([effect.id]).add(simpler)), base)
+            # A number of several that the driving leaves free may end anywhere: it is held at none.
+            loose = {p.name: p.neutral for p in list_implausible(effect) if math.isfinite(p.neutral)}
+            least = [p for p in effect.parameters if p.least is not None and p.name not in effect.fixed]
+            if loose and len(loose) < len(least):
+                held = effect.change(**loose).fix(*loose)
+                return self._reduce(self.fit(fit.state.add(held)), base)
             if effect.id in base.ids:
                 # An effect that another one makes superfluous goes with it.
                 return self._reduce(self._drop(fit, [effect.id]), base)

@@ -33,8 +33,8 @@ _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
 _MOST_STEPS, _FEW_STEPS = 30, 3
 """Steps of a fit, and of one that shows whether a model may come near the best one."""
-_GRID_ROUNDS = 4
-"""Rounds of a grid, each a third as wide as the one before."""
+_GRID = ((1.0, 8), (0.3, 3), (0.1, 2))
+"""Grids of a number without derivatives: their spacing in its steps, and the values on either side."""
 _MOST_WALKS = 4
 """Times that numbers without derivatives are searched in turn with the others."""
 _LOOSEST, _STIFFEST = 1e-6, 30.0
@@ -325,15 +325,15 @@ def _is_pushed_out(state: State, number: Free, pull: float) -> bool:
 
 
 def _walk_grid(fit: PartFit, number: Free, *, exact: bool) -> PartFit:
-    """Search a number on a shrinking grid, the others adapted linearly; then all of them are fitted."""
+    """Search a number on ever finer grids, the others adapted linearly; then all of them are fitted."""
     part, noise, smooth = fit.part, fit.noise, fit.smooth
     columns = pick_columns(fit.columns, smooth)
     value = fit.state.get(number)
-    width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
     best, least = value, measure_cost(part, noise, fit.state, fit.free, fit.residual)
     inverse = invert(fit.normal[np.ix_(smooth, smooth)])
-    for _ in range(_GRID_ROUNDS):
-        for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):
+    for spacing, count in _GRID:
+        around = best + spacing * number.step * np.arange(-count, count + 1)
+        for at in np.delete(around, count).tolist():
             if not number.bounds[0] <= at <= number.bounds[1]:
                 continue
             residual = part.find_residuals(fit.state.set(number, at))
@@ -341,9 +341,9 @@ def _walk_grid(fit: PartFit, number: Free, *, exact: bool) -> PartFit:
                 white = whiten(part, noise, residual, columns)
                 residual = residual - combine_columns(columns, inverse @ (white.columns.T @ white.residual))
             cost = measure_cost(part, noise, fit.state, fit.free, residual)
-            if cost < least:
+            # Values between which no command lies are alike but for rounding.
+            if cost < least - _ENOUGH:
                 best, least = at, cost
-        width /= 3.0
     if best == value:
         return fit
     state = fit.state.set(number, best)

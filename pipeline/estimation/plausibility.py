@@ -7,19 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import format_share, suffix_unit
-from pipeline.models import EXCEEDED_SHARE, OVERSHOOT, Conditions, Effect, Parameter
+from pipeline.models import OVERSHOOT, Conditions, Effect, Parameter
 from pipeline.results import Moves
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from pipeline.estimation.model_fit import Fitted
 
 _AT_BOUND = 1e-3
 """Fraction of a parameter's range; a value closer than this to a bound is at the bound."""
-# A limit's interval is not known during a search: in a 30 s run it may end at this multiple of the value.
 _UNCERTAIN = 1.5
+"""Multiple of a limit's value at which its interval may end: it is not known during a search."""
 
 
 def is_nameable(effect: Effect, conditions: Conditions) -> bool:
@@ -27,16 +24,13 @@ def is_nameable(effect: Effect, conditions: Conditions) -> bool:
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
     if not itself or not is_large_enough(effect, conditions):
         return False
-    highs = {name: _UNCERTAIN * value for name, value in effect.values.items()}
-    if find_exceeded(effect, highs, conditions.exceeded) is not None:
-        return False
-    return find_implausible(effect) is None
+    return not is_exceeded(effect, conditions) and not list_implausible(effect)
 
 
 def is_too_small(effect: Effect, conditions: Conditions) -> bool:
     """Whether all that keeps an effect from a name is its size: others may only imitate it."""
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
-    return itself and find_implausible(effect) is None and not is_large_enough(effect, conditions)
+    return itself and not list_implausible(effect) and not is_large_enough(effect, conditions)
 
 
 def is_large_enough(effect: Effect, conditions: Conditions) -> bool:
@@ -63,41 +57,24 @@ def _is_at_bound(value: float, parameter: Parameter) -> bool:
     return value <= low + margin < parameter.neutral or value >= high - margin > parameter.neutral
 
 
-def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[str, float]) -> str | None:
-    """Sentence stating that measured wheels exceed a limit; None where they stay within it.
-
-    Args:
-        effect: with its values.
-        highs: upper end of the interval by parameter, NaN where there is none.
-        exceeded: what measured wheels exceed in `EXCEEDED_SHARE` of the time, see `Conditions`.
-    """
+def is_exceeded(effect: Effect, conditions: Conditions) -> bool:
+    """Whether measured wheels exceed a limit: its cause is another effect then."""
     for parameter in effect.parameters:
-        most = exceeded.get(parameter.relative_to)
-        value, high = effect.values[parameter.name], highs.get(parameter.name, math.nan)
-        if most is not None and most > OVERSHOOT * max(value, float(np.nan_to_num(high))):
-            return (
-                f"{effect.id}: {parameter.name} = {value:.3g} {parameter.unit} is not a limit: the measured "
-                f"wheels exceed {most:.3g} {parameter.unit} in {format_share(EXCEEDED_SHARE)} of the time; "
-                "the cause may be another effect"
-            )
-    return None
+        most = conditions.exceeded.get(parameter.relative_to)
+        if most is not None and most > OVERSHOOT * _UNCERTAIN * effect.values[parameter.name]:
+            return True
+    return False
 
 
-def find_implausible(effect: Effect) -> str | None:
-    """Sentence stating the first value outside the observed range; None where all values are plausible."""
+def list_implausible(effect: Effect) -> list[Parameter]:
+    """Parameters whose values are outside the observed range."""
+    wild = []
     for parameter in effect.parameters:
-        value = effect.values[parameter.name]
-        if not math.isfinite(value):
-            continue
-        shown = parameter.plausible
+        value, shown = effect.values[parameter.name], parameter.plausible
         low, high = parameter.bounds if shown is None else (shown.low, shown.high)
-        if not low <= value <= high or _is_at_bound(value, parameter):
-            unit = suffix_unit(parameter.unit)
-            return (
-                f"{effect.id}: {parameter.name} = {value:.3g}{unit} is outside the observed range "
-                f"({low:g} to {high:g}{unit}); the cause may be another effect"
-            )
-    return None
+        if math.isfinite(value) and (not low <= value <= high or _is_at_bound(value, parameter)):
+            wild.append(parameter)
+    return wild
 
 
 def measure_moves(fitted: Fitted, effect: Effect) -> Moves | None:

@@ -32,14 +32,17 @@ _MOST_ALTERNATIVES = 3
 def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
     """The effect for text: digits that intervals support, and of several values those that are known.
 
-    A value at neutral is an estimate, not a start value, and stays; so does a single parameter.
+    A value that is estimated to be neutral stays; so does a single parameter.
     """
     new = find_effect(name)()
     effect = new.change(**{k: new.parameter(k).round(one.value, one.digits) for k, one in values.items()})
     if len(new.parameters) == 1:
         return effect
+    unknown = {key: one for key, one in values.items() if one.is_undetermined}
     return effect.omit_open(
-        key for key, one in values.items() if one.is_undetermined and one.value != new.parameter(key).neutral
+        key
+        for key, one in unknown.items()
+        if one.value != new.parameter(key).neutral or not math.isfinite(one.half)
     )
 
 

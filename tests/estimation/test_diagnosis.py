@@ -240,16 +240,18 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
 
 
 @pytest.mark.long
-def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tmp_path: Path) -> None:
+def test_motion_that_lasts_is_unexplained_and_its_own_past_predicts_it(tmp_path: Path) -> None:
     pushed = Disturbance(0.1, 0.15, correlation_s=4.0)
     scenario = replace(_SCENE, effects={"effective_track": 1.8}, disturbance=pushed, duration_s=240.0)
     (run,) = _diagnose(scenario, tmp_path).runs
     left = run.unexplained
     assert left is not None
     assert "w" in left.channels
-    assert "no term that was tried predicts it" in describe_structure(left)
+    assert left.of.startswith("missed v_w, forgotten in")
+    assert "of the heading error over 2 s" in describe_structure(left)
     assert left.formula is None
-    assert run.noise_floor.velocity_rms[2] < 0.5 * run.ladder[-1].velocity_rms[2]
+    # Half a second of it cannot be known from before: that is at the floor.
+    assert run.noise_floor.velocity_rms[2] < 0.7 * run.ladder[-1].velocity_rms[2]
 
 
 def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_it(
