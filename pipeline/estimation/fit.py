@@ -33,6 +33,8 @@ _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
 _MOST_STEPS, _FEW_STEPS = 30, 3
 """Steps of a fit, and of one that shows whether a model may come near the best one."""
+_SHARES = (1.0, 0.5, 0.25, 0.1)
+"""Shares of an extension's start at one of which its fit begins: where the cost is least."""
 _GRID = ((1.0, 8), (0.3, 3), (0.1, 2))
 """Grids of a number without derivatives: their spacing in its steps, and the values on either side."""
 _MOST_WALKS = 4
@@ -251,7 +253,14 @@ def approach(base: PartFit, start: State) -> PartFit:
         base: the fitted model.
         start: the extension, at a start of its new numbers.
     """
-    fit = _begin(base.part, start, base.noise)
+    part, new = base.part, set(start.ids) - set(base.ids)
+    weaker = [start.weaken(new, share) for share in _SHARES]
+    part.look_ahead(weaker)
+    costs = [measure_cost(part, base.noise, one, base.free, part.find_residuals(one)) for one in weaker]
+    own = measure_cost(part, base.noise, base.state, base.free, base.residual)
+    # What changes nothing at all has no derivative, either.
+    acting = [pair for pair in zip(costs, range(len(weaker)), strict=True) if abs(pair[0] - own) > _ENOUGH]
+    fit = _begin(part, weaker[min(acting, default=(0.0, 0))[1]], base.noise)
     return _walk_grids(_descend(fit, _FEW_STEPS)) if fit.free else fit
 
 

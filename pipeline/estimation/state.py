@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -272,6 +272,37 @@ class State:
         for number in free:
             state = state.set(number, other.get(number))
         return state
+
+    def weaken(self, names: Collection[str], share: float) -> State:
+        """The state with a share of what effects do by one number that is not linear: a limit by its inverse.
+
+        Those of several numbers stay: the way from none to all of them leads through other vehicles.
+        """
+        acting = {effect.id: effect.list_acting() for effect in self.effects if effect.id in names}
+        weak = {
+            name: numbers[0]
+            for name, numbers in acting.items()
+            if len(numbers) == 1 and numbers[0].search is Search.STARTS
+        }
+
+        def scale(name: str, value: float) -> float:
+            neutral, (low, high) = weak[name].neutral, weak[name].bounds
+            weaker = value / share if math.isinf(neutral) else neutral + share * (value - neutral)
+            return min(max(weaker, low), high)
+
+        own = {
+            run: {
+                label: scale(label[0], value) if label[0] in weak else value
+                for label, value in numbers.items()
+            }
+            for run, numbers in self.own.items()
+        }
+        changed = [
+            effect.change(**{weak[effect.id].name: scale(effect.id, effect.values[weak[effect.id].name])})
+            for effect in self.effects
+            if effect.id in weak
+        ]
+        return replace(self, own=own).add(*changed)
 
     def move(self, free: Sequence[Free], step: Sequence[float]) -> State:
         """The state with free numbers changed by a step."""

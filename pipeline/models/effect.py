@@ -152,7 +152,7 @@ class Effect(ABC):
     @property
     def is_neutral(self) -> bool:
         """Whether every parameter that has a neutral value is at it."""
-        return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
+        return not self.list_acting()
 
     @classmethod
     def find_page(cls) -> str:
@@ -274,6 +274,10 @@ class Effect(ABC):
             low, high = self.parameter(name).bounds
             values[name] = min(max(value, low), high) if math.isfinite(value) else value
         return self.change(**values)
+
+    def list_acting(self) -> list[Parameter]:
+        """Parameters that are not neutral, of those that have a neutral value."""
+        return [p for p in self.parameters if not math.isnan(p.neutral) and self.values[p.name] != p.neutral]
 
     def list_starts(self, largest: Largest) -> list[dict[str, float]]:
         """Start values of all parameters together."""
