@@ -341,8 +341,8 @@ def _walk_grid(fit: PartFit, number: Free, *, exact: bool) -> PartFit:
     best, least = value, measure_cost(part, noise, fit.state, fit.free, fit.residual)
     inverse = invert(fit.normal[np.ix_(smooth, smooth)])
     for spacing, count in _GRID:
-        around = best + spacing * number.step * np.arange(-count, count + 1)
-        for at in np.delete(around, count).tolist():
+        values = best + spacing * number.step * np.arange(-count, count + 1)
+        for at in np.delete(values, count).tolist():
             if not number.bounds[0] <= at <= number.bounds[1]:
                 continue
             residual = part.find_residuals(fit.state.set(number, at))
