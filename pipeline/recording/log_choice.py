@@ -33,7 +33,6 @@ from pipeline.logs import (
 )
 from pipeline.sources import (
     CONFIGURED,
-    LOCALIZED,
     UNKNOWN_VEHICLE,
     Configuration,
     ConfigurationError,
@@ -50,6 +49,7 @@ from pipeline.sources import (
     choose_sources,
     find_preset,
     find_type,
+    is_localization,
     list_contradictions,
     list_metadata,
     list_topics,
@@ -329,7 +329,7 @@ def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[lis
 
 def _may_be_odometry(pose: PoseSource | None) -> bool:
     """Whether only the content distinguishes this pose from wheel odometry."""
-    return pose is not None and pose.reason != CONFIGURED and not LOCALIZED.search(pose.topic.lower())
+    return pose is not None and pose.reason != CONFIGURED and not is_localization(pose.topic)
 
 
 def _name_vehicle(

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         CONFIGURED,
         DEAD_RECKONED,
         FILTERED,
-        LOCALIZED,
         MEASURED,
         DriveForm,
         DriveSource,
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
         PowerSource,
         Signal,
         Sources,
+        is_localization,
     )
     from pipeline.sources.configuration import (
         LENGTH_UNITS,

@@ -219,9 +219,12 @@ MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual|report")
 DEAD_RECKONED = re.compile(
     r"controller|wheel|encoder|diff_drive|drive_odom|platform/odom|dead|unfiltered|/odom$"
 )
-LOCALIZED = re.compile(
+_LOCALIZED = re.compile(
     r"icp|slam|lidar|laser|map|locali|local_position|global_position|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
     r"|kiss|/pf/|particle|qualisys"
+)
+_ODOMETRY_OF_WHEELS = re.compile(
+    r"(?:controller|wheels?|encoders?|diff_drive)[/_]?odom|odom(?:etry)?[/_](?:wheel|encoder)"
 )
 FILTERED = re.compile(r"(?<!un)filter|ekf|ukf|fused|merged|combined")
 _OF_WHEELS = re.compile(r"wheel|unfiltered|controller|raw")
@@ -235,6 +238,15 @@ _SATELLITES = re.compile(r"gps|gnss|navsat|nmea|rtk|ublox|septentrio|novatel|fix
 _FORMS = {"sides": DriveForm.SIDES, "body": DriveForm.BODY, "steering": DriveForm.STEERING}
 
 Ranked = tuple[float, DriveSource]
+
+
+def is_localization(topic: str) -> bool:
+    """Whether a topic's name says that it localizes, and no later part of it that it is wheel odometry."""
+    name = topic.lower()
+    if not (found := list(_LOCALIZED.finditer(name))):
+        return False
+    later = name[found[-1].end() :].partition("/")[2]
+    return not _ODOMETRY_OF_WHEELS.search(later)
 
 
 @dataclass(frozen=True)
@@ -311,7 +323,7 @@ class Topics:
                 role = "wheels"
             if (role == "command") != commanded:
                 continue
-            is_derived = LOCALIZED.search(name) or FILTERED.search(name)
+            is_derived = is_localization(name) or FILTERED.search(name)
             if role == "odometry" and (is_derived or not DEAD_RECKONED.search(name)):
                 continue
             signals = (Signal(topic, drive.first, drive.unit), Signal(topic, drive.second, drive.unit))

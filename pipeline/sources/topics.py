@@ -11,7 +11,6 @@ from pipeline.logs import TRANSFORM_TYPES, ChannelInfo, find_types, wanted_trans
 from pipeline.sources.candidates import (
     CONFIGURED,
     DEAD_RECKONED,
-    LOCALIZED,
     DriveForm,
     DriveSource,
     PoseContent,
@@ -21,6 +20,7 @@ from pipeline.sources.candidates import (
     Topics,
     TopicSource,
     choose_power,
+    is_localization,
 )
 from pipeline.sources.configuration import (
     Configuration,
@@ -404,9 +404,9 @@ class _Chooser:
             return None
         pose = find_type(self.types[topic]).pose
         if pose is not None and not (pose.orientation or pose.angle):
-            is_position = LOCALIZED.search(name) or _PLACE.search(name)
+            is_position = is_localization(name) or _PLACE.search(name)
             return (1.0, PoseSource(topic, "positions by its type and name")) if is_position else None
-        if LOCALIZED.search(name):
+        if is_localization(name):
             return 3.0, PoseSource(topic, "a localization by its name")
         if DEAD_RECKONED.search(name):
             return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")

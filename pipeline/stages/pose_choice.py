@@ -19,12 +19,12 @@ from pipeline.run import LIVE_SHARE, SPAN_S
 from pipeline.sources import (
     DEAD_RECKONED,
     FILTERED,
-    LOCALIZED,
     Configuration,
     PoseContent,
     PoseSource,
     Sources,
     Vehicle,
+    is_localization,
 )
 from pipeline.stages.drive import read_speed
 from pipeline.stages.extract import Extracted, extract_tables
@@ -241,7 +241,7 @@ def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
         score, reasons = 1.0, ["given in an odometry's frame"]
     else:
         score, reasons = 2.0, ["its frame does not say what it is"]
-    if LOCALIZED.search(name):
+    if is_localization(name):
         score += 1.0
         reasons.append("a localization by its name")
     elif DEAD_RECKONED.search(name) and score < 3.0:  # noqa: PLR2004 - a fixed frame outweighs the name

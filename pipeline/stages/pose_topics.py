@@ -18,7 +18,7 @@ from pipeline.logs import (
     TransformBuffer,
     TransformSeries,
 )
-from pipeline.sources import LOCALIZED, PoseFields, PoseSource, Vehicle, VelocitySection, plain_type
+from pipeline.sources import PoseFields, PoseSource, Vehicle, VelocitySection, is_localization, plain_type
 from pipeline.stages.findings import Finding, StageError
 from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 
@@ -472,7 +472,7 @@ def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
 
 def report_frame(topic: str, parent: str) -> list[Finding]:
     """Report poses that may be odometry, by their frame and the topic's name."""
-    if parent.rsplit("/", 1)[-1] != "odom" or LOCALIZED.search(topic.lower()):
+    if parent.rsplit("/", 1)[-1] != "odom" or is_localization(topic):
         return []
     text = (
         f"{topic} gives poses in {parent}: they are an odometry, which drifts and may come from the wheels; "

@@ -211,6 +211,37 @@ def test_topics_are_chosen(name: str) -> None:
     assert {role: found[role] for role in expected} == expected
 
 
+OF_WHEELS = (
+    "/navio/wheel_odom",
+    "/clio/encoder_odom",
+    "/mapper/wheel_odom",
+    "/slam_bot/diff_drive_controller/odom",
+)
+
+
+@pytest.mark.parametrize("topic", OF_WHEELS)
+def test_a_word_in_the_robots_name_makes_wheel_odometry_no_localization(topic: str) -> None:
+    sources = choose({"/cmd_vel": TWIST, topic: ODOMETRY, "/robot/pose": POSE})
+    assert names(sources) == {"command": "/cmd_vel", "wheels": topic, "pose": "/robot/pose", "imu": None}
+    # Where there is no other, it is taken for what it is.
+    alone = choose({"/cmd_vel": TWIST, topic: ODOMETRY}).pose
+    assert alone is not None
+    assert "comes from the wheels" in alone.reason
+
+
+LOCALIZATIONS = (
+    "/fastlio/odom", "/rtabmap/odom", "/lidar_slam/odom", "/wheel_odom/icp", "/base_controller/slam/odom",
+    "/vicon/wheel_loader/odom", "/openvio/odometry", "/slam_bot/wheel_lidar_odom/map",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("topic", LOCALIZATIONS)
+def test_a_localization_is_told_by_its_name(topic: str) -> None:
+    pose = choose({"/cmd_vel": TWIST, topic: ODOMETRY, "/robot/pose": POSE}).pose
+    assert pose is not None
+    assert (pose.topic, pose.reason) == (topic, "a localization by its name")
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_every_simulated_layout_is_understood(name: str) -> None:
     layout = LAYOUTS[name]

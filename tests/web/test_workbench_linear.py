@@ -32,7 +32,7 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
     "unit": ("m", lambda text: parse_unit(text, "")),
     "configuration": ("[", sources._read_header),
     "complaint": ("at `$", lambda text: sources._find(sources._PLACE, text)),
-    "topic": ("/", candidates.LOCALIZED.search),
+    "topic": ("/", candidates.is_localization),
     "pose frame": ("/", pose_choice._FIXED_FRAME.search),
     "field path": ("[1].", lambda text: Signal.parse(f"/topic.{text}").fields()),
     "robot description": ("<robot>", read_description),
