@@ -10,7 +10,7 @@ from pipeline.core import NORMAL_95, Flags, Floats
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import Motion
-from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
+from pipeline.recording.readings import GRID_S, SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, compare
 from pipeline.stages import CommandTimeout
 
@@ -129,6 +129,8 @@ def _find_period(reading: Reading) -> float:
 
 def hold(reading: Reading, seconds: float) -> Reading:
     """A command that is zero from a time [s] after its last message on, until the next one."""
+    if not reading.inputs:
+        return reading
     period = _find_period(reading)
     first, second, third = (
         None if one is None or isinstance(one, Bent) else _hold(one, seconds, period)
@@ -146,7 +148,9 @@ def _hold(one: Held, seconds: float, period: float) -> Held:
     gaps = np.diff(one.times)
     times, values, live = [one.times], [one.values], [one.live]
     for row in np.flatnonzero(gaps > min(seconds, _PERIODS * period)).tolist():
-        after = np.arange(period, gaps[row], period)
+        # Signals are read on a grid: samples nearer to each other say nothing more.
+        step = max(period, GRID_S)
+        after = np.arange(step, gaps[row], step)
         if seconds < gaps[row]:
             after = np.sort(np.append(after, seconds))
         times.append(one.times[row] + after)
