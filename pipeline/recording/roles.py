@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -57,7 +58,10 @@ def read_drives(case: Case, motion: Motion) -> list[Candidate]:
 
 
 def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
-    """Leave out velocities along the axes of a map: turned by the heading, they are of rolling wheels."""
+    """Leave out velocities along the axes of a map: turned by the heading, they are of rolling wheels.
+
+    Those without a number ahead say nothing of it, nor of a base that moves sideways.
+    """
     if not case.moves_sideways or case.vehicle.kinematics.has_inputs("sideways"):
         return
     of_role = (case.sources.rank_drives(role) for role in ("command", "wheels"))
@@ -68,6 +72,11 @@ def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
         if source.form is DriveForm.BODY and source.reason != CONFIGURED:
             reading = case.read(source, is_measured=True)
         if reading is None or reading.first is None or reading.third is None or not reading.third.moves:
+            continue
+        if not reading.first.times.size:
+            text = f"not used: {source}: it has no number for the speed ahead"
+            case.findings.append(Finding("numbers_not_used", "info", text, where=source.signals[0].topic))
+            case.leave_out(source)
             continue
         last = np.searchsorted(reading.first.times, at, side="right") - 1
         velocity = np.interp(at, reading.first.times, reading.first.values) + 1j * np.interp(
@@ -117,8 +126,8 @@ def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading 
         f"the joints of {source} do not name their side; by the motion {names['left']} are left and "
         f"{names['right']} right"
     )
-    line = "; ".join(f"{side} = [{', '.join(repr(one) for one in listed)}]" for side, listed in sides.items())
-    case.correct("wheels", what, line.replace("'", '"'), dict(sides))
+    line = "; ".join(f"{side} = {json.dumps(names, ensure_ascii=False)}" for side, names in sides.items())
+    case.correct("wheels", what, line, dict(sides))
     section = case.complete().wheels
     return case.read(source, is_measured=True, section=section)
 

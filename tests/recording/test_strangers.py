@@ -82,6 +82,17 @@ def test_velocities_along_the_axes_of_a_map_make_no_mecanum(tmp_path: Path) -> N
     assert "not used: /robot/velocity: its velocities are along the axes of a map" in told(setup)
 
 
+def test_velocities_of_which_one_axis_is_unknown_make_no_mecanum(tmp_path: Path) -> None:
+    robot = Robot()
+    turn = robot.does.turn
+    linear = {"twist.linear.x": np.full(turn.size, np.nan), "twist.linear.y": robot.does.speed}
+    broken = record_cdr(robot.does, "/robot/velocity", TWIST, linear | {"twist.angular.z": turn})
+    setup = set_up(tmp_path, robot.command(), broken, robot.base(), robot.pose())
+    assert (str(setup.sources.command), str(setup.sources.wheels)) == ("/cmd_vel", "/joint_states")
+    assert setup.vehicle.kind == "differential"
+    assert "not used: /robot/velocity: it has no number for the speed ahead" in told(setup)
+
+
 @pytest.mark.parametrize("of_map", [False, True], ids=["body", "map"])
 def test_a_measured_motion_is_no_command_where_nothing_else_is_recorded(
     of_map: bool,  # noqa: FBT001
