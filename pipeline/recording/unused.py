@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterator, Mapping
 from itertools import islice
@@ -36,6 +37,9 @@ _UNITS: Mapping[str, str] = {
 _ANY_UNIT = ' (the motion shows their unit; unit = "rad/s", "m/s", "rpm" or "rad" gives it)'
 _WHEELS = {2: "two", 4: "four", 6: "six"}
 """Numbers of wheels of a vehicle that turns by the speeds of its sides."""
+_SEVERAL = (
+    "wheels of both sides (put the number of a left one for 0 and that of a right one for 1, counted from 0)"
+)
 _MOST = 3
 """Maximum number of lines that are offered for a role."""
 
@@ -79,10 +83,11 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
         if values is None or not is_side or not np.ptp(values, axis=0).all():
             continue
         role = "command" if COMMANDED.search(topic.lower()) else "wheels"
+        left, right = (_quote(f"{topic}.{field}[{number}]") for number in range(len(SIDES)))
         text = (
             f"not used: {topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they "
-            f'are the left and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
-            f'right_topic = "{topic}.{field}[1]"{_ANY_UNIT}'
+            f"are {'the left and right wheels' if count == len(SIDES) else _SEVERAL}, in run.toml: [{role}] "
+            f"left_topic = {left}; right_topic = {right}{_ANY_UNIT}"
         )
         severity: Severity = "info" if getattr(sources, role) else "warning"
         findings.append(Finding("numbers_not_used", severity, text, where=topic))
@@ -102,9 +107,14 @@ def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[Finding]:
         unit = next((text for word, text in _UNITS.items() if re.search(word, lower)), _ANY_UNIT)
         text = (
             f"not used: {left} and {right}, whose meaning is not known; if they are the left and right "
-            f'wheels, in run.toml: [{role}] left_topic = "{left}"; right_topic = "{right}"{unit}'
+            f"wheels, in run.toml: [{role}] left_topic = {_quote(left)}; right_topic = {_quote(right)}{unit}"
         )
         yield Finding("numbers_not_used", "warning", text, where=topic)
+
+
+def _quote(name: str) -> str:
+    """A string of TOML."""
+    return json.dumps(name, ensure_ascii=False)
 
 
 def _name_right(match: re.Match[str]) -> str:
@@ -121,8 +131,8 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         if plain_type(index.types[topic]) == JOYSTICK:
             text = (
                 f"not used: {topic} (a joystick); if two of its axes are the command, in run.toml: "
-                f'[command] speed_topic = "{topic}.axes[1]"; yaw_rate_topic = "{topic}.axes[0]" (which axes, '
-                "the set-up of its driver says)"
+                f"[command] speed_topic = {_quote(f'{topic}.axes[1]')}; "
+                f"yaw_rate_topic = {_quote(f'{topic}.axes[0]')} (which axes, the set-up of its driver says)"
             )
             yield Finding("numbers_not_used", "warning", text, where=topic)
             continue
@@ -132,8 +142,9 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         turns += [("steering_topic", path) for path, end in ends.items() if _STEER.search(end)]
         if speeds and turns:
             key, turn = turns[0]
+            speed, turn = (_quote(f"{topic}.{path}") for path in (speeds[0], turn))
             text = (
                 f"not used: {topic} (a speed and a turn), whose meaning is not known; if it is the command, "
-                f'in run.toml: [command] speed_topic = "{topic}.{speeds[0]}"; {key} = "{topic}.{turn}"'
+                f"in run.toml: [command] speed_topic = {speed}; {key} = {turn}"
             )
             yield Finding("numbers_not_used", "warning", text, where=topic)

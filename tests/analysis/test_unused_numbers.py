@@ -1,5 +1,6 @@
 """Topics of two numbers a message are named, with the lines that take them for wheels."""
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +56,26 @@ def test_two_numbers_a_message_are_named_with_the_lines_that_use_them(
 def test_four_numbers_of_motors_are_named(tmp_path: Path) -> None:
     drive = draw_drive()
     pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
-    speeds = record_numbers(drive, np.tile(wheel_speeds(drive), 2), "/motor_rpm")
+    speeds = record_numbers(drive, np.repeat(wheel_speeds(drive), 2, axis=1), "/motor_rpm")
     log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, speeds)
-    assert read_findings(log)["numbers_not_used"].startswith("not used: /motor_rpm (four numbers a message)")
+    said = read_findings(log)["numbers_not_used"]
+    assert said.startswith("not used: /motor_rpm (four numbers a message)")
+    # The first two may be of one side.
+    assert "put the number of a left one for 0 and that of a right one for 1" in said
+
+
+def test_a_topic_with_quotes_is_written_as_toml_reads_it(tmp_path: Path) -> None:
+    drive = draw_drive()
+    pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
+    topic = '/the "fast\\slow" wheels'
+    speeds = record_numbers(drive, wheel_speeds(drive), topic)
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, speeds)
+    said = read_findings(log)["numbers_not_used"]
+    lines = said.partition("[wheels] ")[2].partition(" (the motion")[0].split("; ")
+    assert tomllib.loads("\n".join(lines)) == {
+        "left_topic": f"{topic}.data[0]",
+        "right_topic": f"{topic}.data[1]",
+    }
 
 
 @pytest.mark.parametrize(
