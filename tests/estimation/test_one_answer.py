@@ -99,7 +99,7 @@ def check_page(told: Json, screen: str, everything: str) -> None:
     """The report counts the smaller effects as the screen does, and says the same of what remains."""
     report = RunReport({"run": told["run"]}, diagnosis=read_result(told, RunDiagnosis))
     page, shown, whole = render_report(report), *(" ".join(text.split()) for text in (screen, everything))
-    assert re.findall(r"and (\d+) smaller effect", page) == re.findall(r"(\d+) smaller effect", shown)
+    assert re.findall(r"(\d+) smaller effect", page) == re.findall(r"(\d+) smaller effect", shown)
     remaining = format_remaining(report)
     assert remaining in page
     assert remaining.replace("remaining error ", "remaining ") in whole
