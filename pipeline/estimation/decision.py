@@ -336,8 +336,9 @@ class Search:
             if simpler is not None and simpler.id in known:
                 return self._reduce(self.fit(fit.state.drop([effect.id]).add(simpler)), base)
             # A number of several that the driving leaves free may end anywhere: it is held at none.
-            loose = {p.name: p.neutral for p in list_implausible(effect) if math.isfinite(p.neutral)}
-            least = [p for p in effect.parameters if p.least is not None and p.name not in effect.fixed]
+            free = [p for p in effect.parameters if p.name not in effect.fixed and math.isfinite(p.neutral)]
+            loose = {p.name: p.neutral for p in list_implausible(effect) if p in free}
+            least = [p for p in free if p.least is not None]
             if loose and len(loose) < len(least):
                 held = effect.change(**loose).fix(*loose)
                 return self._reduce(self.fit(fit.state.add(held)), base)

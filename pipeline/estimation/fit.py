@@ -255,12 +255,14 @@ def approach(base: PartFit, start: State) -> PartFit:
     """
     part, new = base.part, set(start.ids) - set(base.ids)
     weaker = [start.weaken(new, share) for share in _SHARES]
-    part.look_ahead(weaker)
-    costs = [measure_cost(part, base.noise, one, base.free, part.find_residuals(one)) for one in weaker]
-    own = measure_cost(part, base.noise, base.state, base.free, base.residual)
-    # What changes nothing at all has no derivative, either.
-    acting = [pair for pair in zip(costs, range(len(weaker)), strict=True) if abs(pair[0] - own) > _ENOUGH]
-    fit = _begin(part, weaker[min(acting, default=(0.0, 0))[1]], base.noise)
+    if weaker[-1] != weaker[0]:
+        part.look_ahead(weaker)
+        costs = [measure_cost(part, base.noise, one, base.free, part.find_residuals(one)) for one in weaker]
+        own = measure_cost(part, base.noise, base.state, base.free, base.residual)
+        # What changes nothing at all has no derivative, either.
+        acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
+        start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
+    fit = _begin(part, start, base.noise)
     return _walk_grids(_descend(fit, _FEW_STEPS)) if fit.free else fit
 
 

@@ -290,10 +290,12 @@ class State:
             weaker = value / share if math.isinf(neutral) else neutral + share * (value - neutral)
             return min(max(weaker, low), high)
 
+        if not weak:
+            return self
         own = {
             run: {
-                label: scale(label[0], value) if label[0] in weak else value
-                for label, value in numbers.items()
+                (name, of): scale(name, value) if name in weak and of == weak[name].name else value
+                for (name, of), value in numbers.items()
             }
             for run, numbers in self.own.items()
         }
