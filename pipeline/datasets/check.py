@@ -470,12 +470,15 @@ def keep_baseline(check: Check, path: Path) -> None:
     """Write the side AFTER as a baseline for later checks, replacing an older one.
 
     Raises:
-        ComparisonError: ``baseline_stays``: the check is broken, and a baseline already exists.
+        ComparisonError: ``baseline_stays``: the check is broken, or a number differs, and a baseline already
+            exists.
         MotionError: ``baseline_unwritable``.
     """
-    if check.code == BROKEN and path.exists():
-        what = "the check is broken, and the baseline stays as it is"
-        hint = "Delete it, if what was changed is to be the new normal."
+    differing = check.list_status("differs")
+    if (check.code == BROKEN or differing) and path.exists():
+        why = "the check is broken" if check.code == BROKEN else f"the runs differ in {', '.join(differing)}"
+        what = f"{why}, and the baseline stays as it is"
+        hint = "Delete it, if what is measured now is to be the new normal."
         raise ComparisonError("baseline_stays", what, where=str(path), hint=hint)
     write_text(path, format_baseline(check.sides), code="baseline_unwritable")
 

@@ -253,6 +253,24 @@ def test_a_baseline_stands_for_its_runs(same: Sides, late: Sides, tmp_path: Path
     assert path.read_text(encoding="utf-8") == text
 
 
+def test_a_single_run_that_differs_does_not_replace_a_baseline(
+    same: Sides, late: Sides, tmp_path: Path
+) -> None:
+    path = tmp_path / "robot.json"
+    one = replace(same, after=same.after[:1])
+    keep_baseline(compare(one), path)
+    text = path.read_text(encoding="utf-8")
+    kept = read_baseline(path)
+
+    found = compare(replace(late, before=kept.readings, after=late.after[:1]))
+
+    assert found.code == UNDETERMINED
+    with pytest.raises(ComparisonError, match=r"the runs differ in drive_lag\.tau") as raised:
+        keep_baseline(found, path)
+    assert raised.value.code == "baseline_stays"
+    assert path.read_text(encoding="utf-8") == text
+
+
 @pytest.mark.parametrize(
     "damage",
     [
