@@ -93,7 +93,7 @@ class Difference:
         a, b: datasets; b has the larger slip.
         total: difference of RMS slip [m/s].
         parts: causes in descending order; they add up to the total.
-        unit: unit of the permutation test and of the intervals.
+        unit: unit of the tests and of the intervals.
         note: what these numbers of runs cannot show; empty where there is no limitation.
     """
 
@@ -260,21 +260,24 @@ def _compare(a: _Group, b: _Group) -> Difference:
             half = float(np.hypot(half_first[0], half_second[0]))
             low, high = difference - half, difference + half
         elif pool_spread([first, second])[1]:
-            (outcome,) = compare_means([first, second], [(0, 1)], tests=len(squares)).differences
-            p, ends = outcome.p, outcome.interval
-            low, high = (low, high) if ends is None else (ends.low, ends.high)
+            test = compare_means([first, second], [(0, 1)], tests=len(squares))
+            # Zeros of a cause that no run has do not scatter: they tell no spread of the other side.
+            if not test.is_pooled or (first.any() and second.any()):
+                (outcome,) = test.differences
+                p, ends = outcome.p, outcome.interval
+                low, high = (low, high) if ends is None else (ends.low, ends.high)
         tests.append((low, high, p))
-    ps = [p for *_, p in tests]
-    is_tested = not math.isnan(ps[0])
-    adjusted = adjust_holm(ps).tolist() if is_tested else ps
+    known = np.isfinite([p for *_, p in tests])
+    adjusted = np.full(known.size, np.nan)
+    adjusted[known] = adjust_holm(np.array([p for *_, p in tests])[known])
     parts = [
         CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q)
         for ((name, kind), difference), (low, high, p), q in zip(
-            squares.items(), tests, adjusted, strict=True
+            squares.items(), tests, adjusted.tolist(), strict=True
         )
     ]
     parts.sort(key=lambda part: -abs(part.difference))
-    note = ABOUT_BLOCKS if single else "" if is_tested else NO_SPREAD
+    note = ABOUT_BLOCKS if single else "" if known.any() else NO_SPREAD
     return Difference(a.name, b.name, total, tuple(parts), BLOCKS if single else RUNS, note)
 
 

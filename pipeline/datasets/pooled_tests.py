@@ -30,8 +30,9 @@ class Difference:
 
     Attributes:
         value: the difference, in the unit of the values.
-        interval: 95 % interval; of the pair alone by permutation, else of all pairs at once.
-        p: two-sided p of the pair alone.
+        interval: 95 % interval; of the pair alone by permutation, else of all pairs at once. None where the
+            numbers of runs reject nothing, and where runs that do not scatter at all differ.
+        p: two-sided p of the pair alone; NaN where runs that do not scatter at all differ.
         p_adjusted: p over all pairs.
         smallest_p: smallest p possible with these numbers of runs, whatever the difference.
     """
@@ -52,12 +53,14 @@ class MeansTest:
         spread: standard deviation between runs of a group, pooled, in the unit of the values.
         freedom: its degrees of freedom.
         differences: one a pair, in the order of the pairs.
+        is_pooled: whether the tests take the pooled spread.
     """
 
     method: str
     spread: float
     freedom: int
     differences: tuple[Difference, ...]
+    is_pooled: bool = False
 
 
 def pool_spread(groups: Sequence[Floats]) -> tuple[float, int]:
@@ -113,6 +116,7 @@ def compare_means(
     values = [check_values(group, what="values of a group") for group in groups]
     spread, freedom = pool_spread(values)
     over = f" over {len(pairs)} pairs" if len(pairs) > 1 else ""
+    is_pooled = False
     if do_spreads_differ(values):
         method = f"Games-Howell{over}, spreads between {unit} differ"
         differences = _compare_games_howell(values, pairs)
@@ -120,13 +124,14 @@ def compare_means(
         method = f"exact permutation of whole {unit}" + f", Holm{over}" * bool(over)
         differences = _compare_permuted(values, pairs)
     else:
+        is_pooled = True
         method = f"Tukey-Kramer{over}, spread between {unit} pooled"
         errors = [spread * math.sqrt(1.0 / values[i].size + 1.0 / values[j].size) for i, j in pairs]
         differences = [
             _studentize(float(values[j].mean() - values[i].mean()), error, len(values), freedom)
             for (i, j), error in zip(pairs, errors, strict=True)
         ]
-    return MeansTest(method, spread, freedom, tuple(differences))
+    return MeansTest(method, spread, freedom, tuple(differences), is_pooled)
 
 
 def _compare_games_howell(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) -> list[Difference]:
@@ -142,15 +147,22 @@ def _compare_games_howell(groups: Sequence[Floats], pairs: Sequence[tuple[int, i
     return differences
 
 
+_ROUNDING = 1e-12
+"""Standard error below this share of a difference is that of the arithmetic: nothing scatters."""
+
+
 def _studentize(value: float, error: float, groups: int, freedom: float) -> Difference:
     """A difference with its standard error among the differences of so many groups."""
-    if error == 0.0:
-        p = 1.0 if value == 0.0 else 0.0
-        return Difference(value, Interval(value, value), p, p, 0.0)
-    score = abs(value) / error
+    if value == error == 0.0:
+        return Difference(value, Interval(value, value), 1.0, 1.0, 0.0)
+    if error <= _ROUNDING * abs(value):
+        return Difference(value, None, math.nan, math.nan, math.nan)
+    score, alone = abs(value) / error, freedom
+    if groups > 2:  # noqa: PLR2004 - a limit of a range takes a tenth of a second: pairs alike share it
+        freedom = float(f"{freedom:.2g}")
     half = error * _find_limit(groups, freedom)
     interval = Interval(value - half, value + half)
-    return Difference(value, interval, _find_p(score, 2, freedom), _find_p(score, groups, freedom), 0.0)
+    return Difference(value, interval, _find_p(score, 2, alone), _find_p(score, groups, freedom), 0.0)
 
 
 def _find_p(score: float, groups: int, freedom: float) -> float:
@@ -166,7 +178,7 @@ def _find_p(score: float, groups: int, freedom: float) -> float:
     return min(max(p, 0.0), 1.0)
 
 
-@functools.cache
+@functools.lru_cache(maxsize=256)
 def _find_limit(groups: int, freedom: float) -> float:
     """Difference of equal groups, in standard errors, that the largest exceeds at the significance level."""
     from scipy.stats import studentized_range, t  # noqa: PLC0415 - heavy

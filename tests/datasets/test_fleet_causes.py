@@ -87,3 +87,17 @@ def test_equal_deployments_are_rarely_said_to_differ() -> None:
         said += any(part.p_adjusted < 0.05 for part in difference.parts)
     # Of 60 with a chance of 5 %, more than 8 come in fewer than one of a hundred trials.
     assert said <= 8
+
+
+@pytest.mark.parametrize("runs", [(3, 1), (1, 3), (2, 2)])
+def test_a_cause_that_one_side_lacks_is_not_tested_by_the_spread_of_zeros(runs: tuple[int, int]) -> None:
+    rows = pl.concat([draw("asphalt", ASPHALT, runs[0]), draw("ice", ICE, runs[1])])
+    _, (difference,) = compare_causes(rows)
+    parts = {part.name: part for part in difference.parts}
+    for name in ("wheel_radius", "turn_lag"):
+        assert all(math.isnan(number) for number in (parts[name].low, parts[name].high, parts[name].p))
+        assert math.isnan(parts[name].p_adjusted)
+        assert parts[name].difference != 0.0
+    assert 0.0 < parts["disturbance"].p < 0.05
+    assert parts["disturbance"].low < parts["disturbance"].difference < parts["disturbance"].high
+    assert difference.note == ""

@@ -79,10 +79,27 @@ def test_runs_that_are_enough_for_one_pair_are_not_permuted_beside_others() -> N
     assert compare_means(groups[:2], [(0, 1)], tests=3).method.startswith("Tukey-Kramer")
 
 
-def test_runs_without_any_scatter_have_no_doubt() -> None:
-    equal, other = compare_means([np.ones(2), np.ones(2)], [(0, 1)]), [np.ones(3), 2.0 * np.ones(1)]
-    assert equal.differences[0].p == 1.0
-    assert compare_means(other, [(0, 1)]).differences[0].p == 0.0
+def test_intervals_of_many_groups_exclude_zero_exactly_where_their_p_is_below_5_percent() -> None:
+    rng = np.random.default_rng(3)
+    groups = [rng.normal(0.1 * i, 0.05 * (1 + i % 4), 5) for i in range(6)]
+    groups[5] = rng.normal(0.5, 3.0, 5)
+    found = compare_means(groups, list(combinations(range(6), 2)))
+    assert found.method.startswith("Games-Howell")
+    assert len({one.p_adjusted <= 0.05 for one in found.differences}) == 2
+    for one in found.differences:
+        assert one.interval is not None
+        assert (not one.interval.low <= 0.0 <= one.interval.high) == (one.p_adjusted <= 0.05)
+
+
+@pytest.mark.parametrize("level", [1.0, 0.3])
+def test_runs_without_any_scatter_are_equal_or_not_tested(level: float) -> None:
+    (equal,) = compare_means([np.full(2, level), np.full(2, level)], [(0, 1)]).differences
+    assert equal.p == 1.0
+    (other,) = compare_means([np.full(3, level), np.full(1, 2.0 * level)], [(0, 1)]).differences
+    assert other.value == pytest.approx(level)
+    assert math.isnan(other.p)
+    assert math.isnan(other.p_adjusted)
+    assert other.interval is None
     assert not do_spreads_differ([np.ones(4), 2.0 * np.ones(4)])
 
 
