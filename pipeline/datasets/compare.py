@@ -81,7 +81,8 @@ def read_samples(
 
 def _take_samples(times: pl.Series, values: pl.Series) -> Samples:
     order = times.arg_sort()
-    return Samples(values[order].to_numpy(), float(np.ptp(times.to_numpy())))
+    step = float(np.median(np.diff(times[order].to_numpy())))
+    return Samples(values[order].to_numpy(), len(times) * step)
 
 
 def follow_published_runs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,9 +11,11 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import STRETCH_S, Floats, number_in, pick
+from pipeline.core import FEWEST_OF_SPREAD, ROUNDING_S, STRETCH_S, Floats, number_in, pick
 from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pooled_tests import (
+    Difference,
+    MeansTest,
     bound_levels,
     compare_means,
     exponentiate,
@@ -36,12 +39,16 @@ from schemas import contract_of
 RUNS = "runs"
 BLOCKS = "blocks"
 PARTS = 8
-"""Parts of a single run: medians of eight equal parts of 2 to 10 minutes are called different in 4 to 7 % of
-equal runs whose slip remembers 0.5 to 2.5 s; all labellings of eight and eight can be counted."""
+"""Most parts of a single run: medians of eight equal parts of 2 to 10 minutes are called different in 4 to
+7 % of equal runs whose slip remembers 0.5 to 2.5 s; all labellings of eight and eight can be counted."""
 ABOUT_BLOCKS = "a difference between two runs, not between terrains"
 NOT_SHARED = "no driving in common, no number"
 NO_SPREAD = "too few runs to know how much runs differ: no test"
-TOO_SHORT = f"{ABOUT_BLOCKS}; too short for a test, which takes two stretches of {STRETCH_S:g} s of each"
+NO_SCATTER = "neither side has any variation: no test"
+TOO_SHORT = (
+    f"{ABOUT_BLOCKS}; too short for a test, "
+    f"which takes {FEWEST_OF_SPREAD} stretches of {STRETCH_S:g} s of each"
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ class Samples:
 
     Attributes:
         values: the compared quantity, ascending in time, shape (n,).
-        duration_s: time from the first to the last [s].
+        duration_s: time that they stand for [s]: their number times their usual step, without gaps.
     """
 
     values: Floats
@@ -61,11 +68,25 @@ class Samples:
         """Median of the run."""
         return float(np.median(self.values))
 
-    @property
-    def parts(self) -> Floats:
-        """Medians of equal parts of the run, none shorter than a stretch that is treated as independent."""
-        most = min(PARTS, self.values.size, int(self.duration_s // STRETCH_S))
-        return np.array([np.median(part) for part in np.array_split(self.values, max(most, 1))])
+    def cut(self, length_s: float) -> Floats:
+        """Medians of parts of equal length, evenly over the run.
+
+        Args:
+            length_s: length of a part [s].
+
+        Returns:
+            Shape (k,), at most `PARTS`; the median of the run where no part fits.
+        """
+        count = min(PARTS, int((self.duration_s + ROUNDING_S) // length_s), self.values.size)
+        if count == 0:
+            return np.array([self.median])
+        size = min(max(round(self.values.size * length_s / self.duration_s), 1), self.values.size // count)
+        first = (
+            np.linspace(0.0, self.values.size - size, count).astype(np.int64)
+            if count > 1
+            else np.zeros(1, np.int64)
+        )
+        return np.array([np.median(self.values[at : at + size]) for at in first.tolist()])
 
 
 @dataclass(frozen=True)
@@ -161,14 +182,24 @@ def compare_groups(
         own = [groups[i] for i in family]
         pairs = [(family.index(i), family.index(j)) for i, j in numbered if i in family]
         by_runs = any(group.values.size > 1 for group in own) or not all(group.runs for group in own)
-        units = [group.values if by_runs else group.runs[0].parts for group in own]
+        units = [group.values for group in own] if by_runs else _cut_alike([group.runs[0] for group in own])
         compared += _compare_family(own, units, pairs, overlaps, RUNS if by_runs else BLOCKS)
     return sorted(compared, key=lambda pair: (pair.a.name, pair.b.name))
 
 
 def bound_run(run: Samples) -> Interval | None:
     """Interval of one run's median from its parts; it applies to this run, not to its terrain."""
-    return bound_levels([run.parts])[0]
+    return bound_levels(_cut_alike([run]))[0]
+
+
+def _cut_alike(runs: Sequence[Samples]) -> list[Floats]:
+    """Medians of parts of runs, of one length: those of shorter parts scatter more.
+
+    The shortest run that can be tested has `PARTS`, or fewer as none is shorter than `STRETCH_S`.
+    """
+    long = [run.duration_s for run in runs if run.duration_s + ROUNDING_S >= FEWEST_OF_SPREAD * STRETCH_S]
+    length_s = max(min(long, default=0.0) / PARTS, STRETCH_S)
+    return [run.cut(length_s) for run in runs]
 
 
 def _compare_family(
@@ -185,8 +216,7 @@ def _compare_family(
         for i, j in pairs
         if overlaps is None or overlaps[frozenset((groups[i].name, groups[j].name))].bins
     ]
-    test = compare_means(units, known, unit=unit) if known and pool_spread(units)[1] else None
-    differences = dict(zip(known, test.differences, strict=True)) if test else {}
+    test, differences = _test_units(units, known, unit)
     compared = []
     for i, j in pairs:
         a, b = groups[i], groups[j]
@@ -209,6 +239,9 @@ def _compare_family(
         if test is None or difference is None:
             compared.append(replace(pair, note=NO_SPREAD if unit == RUNS else TOO_SHORT))
             continue
+        if math.isnan(difference.p):
+            compared.append(replace(pair, note=NO_SCATTER))
+            continue
         if (ends := difference.interval) is not None:
             pair = _bound_pair(pair, units[i], units[j], ends, positive=positive)
         if unit == RUNS:
@@ -217,6 +250,23 @@ def _compare_family(
         numbers = pick(difference, "p", "p_adjusted", "smallest_p")
         compared.append(replace(pair, method=test.method, note="; ".join(notes), **numbers))
     return compared
+
+
+def _test_units(
+    units: Sequence[Floats], pairs: Sequence[tuple[int, int]], unit: str
+) -> tuple[MeansTest | None, dict[tuple[int, int], Difference]]:
+    """Test of the pairs with enough units, and its differences by pair.
+
+    A single run tells a spread by its own parts only, so that one with too few of them is not tested.
+    """
+    least = 1 if unit == RUNS else FEWEST_OF_SPREAD
+    tested = [place for place, own in enumerate(units) if own.size >= least]
+    asked = [pair for pair in pairs if {*pair} <= {*tested}]
+    values = [units[place] for place in tested]
+    if not asked or not pool_spread(values)[1]:
+        return None, {}
+    test = compare_means(values, [(tested.index(i), tested.index(j)) for i, j in asked], unit=unit)
+    return test, dict(zip(asked, test.differences, strict=True))
 
 
 def _bound_pair(pair: Pair, a: Floats, b: Floats, ends: Interval, *, positive: bool) -> Pair:
@@ -231,7 +281,7 @@ def _bound_pair(pair: Pair, a: Floats, b: Floats, ends: Interval, *, positive: b
 def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
     """Difference of the medians of two sides, from that of their logarithms and the mean of these."""
     mean, share = float(np.concatenate((a, b)).mean()), b.size / (a.size + b.size)
-    return float(np.exp(mean + (1.0 - share) * difference) - np.exp(mean - share * difference))
+    return exponentiate(mean + (1.0 - share) * difference) - exponentiate(mean - share * difference)
 
 
 def _ask_published(a: Group, b: Group) -> float:

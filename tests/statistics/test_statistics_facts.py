@@ -99,20 +99,44 @@ def test_the_bounds_are_where_the_test_begins_to_reject() -> None:
     assert there[0] == pytest.approx(-back[1])
 
 
-def test_a_run_stands_as_eight_equal_parts_of_ten_seconds_at_least() -> None:
+def test_a_run_stands_as_parts_of_one_length_evenly_over_it() -> None:
     values = np.repeat(np.arange(1.0, 9.0), 50)
-    assert Samples(values, 400.0).parts.tolist() == list(range(1, 9))
-    assert Samples(values, 40.0).parts.size == 4
-    assert Samples(values, 9.0).parts.tolist() == [4.5]
-    assert Samples(values[:3], 400.0).parts.size == 3
+    assert Samples(values, 400.0).cut(50.0).tolist() == list(range(1, 9))
+    assert Samples(values, 400.0).cut(10.0).tolist() == list(range(1, 9)), (
+        "eight at most, from all of the run"
+    )
+    assert Samples(values, 40.0).cut(10.0).size == 4
+    assert Samples(values, 9.0).cut(10.0).tolist() == [4.5]
+    assert Samples(values[:3], 400.0).cut(50.0).size == 3
     assert bound_run(Samples(values, 29.0)) is None, "two parts do not determine a spread"
 
 
-def test_runs_too_short_to_be_cut_are_not_tested() -> None:
-    short = [Group.of_runs(name, [Samples(np.full(9, 1.0), 8.0)]) for name in "ab"]
-    (pair,) = compare_groups(short)
+def single(name: str, seconds: float, median: float = 1.0) -> Group:
+    rng = np.random.default_rng(round(seconds))
+    values = rng.lognormal(math.log(median), 0.1, round(20 * seconds))
+    return Group.of_runs(name, [Samples(values, seconds)])
+
+
+@pytest.mark.parametrize("seconds", [1.0, 8.0, 29.0])
+def test_runs_without_three_parts_are_not_tested(seconds: float) -> None:
+    pairs = compare_groups([single("a", seconds), single("b", 600.0), single("c", 600.0, 2.0)])
+    short, other, tested = pairs
+    for pair in (short, other):
+        assert pair.p is None
+        assert pair.ratio is not None
+        assert "which takes 3 stretches of 10 s of each" in pair.note
+    (alone,) = compare_groups([single("b", 600.0), single("c", 600.0, 2.0)])
+    assert tested.p == alone.p
+    assert tested.p is not None
+    assert tested.p < 0.01
+
+
+def test_groups_that_do_not_scatter_are_not_tested() -> None:
+    (pair,) = compare_groups([Group("a", np.full(3, 0.3)), Group("b", np.full(1, 0.7))])
     assert pair.p is None
-    assert "too short" in pair.note
+    assert pair.low is None
+    assert pair.ratio == pytest.approx(7.0 / 3.0)
+    assert "no test" in pair.note
 
 
 def test_mann_whitney_is_scipys() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from simulated_runs import RATE, simulate_runs
 
-from pipeline.datasets.pairs import Samples, bound_run
+from pipeline.datasets.pairs import Group, Samples, bound_run, compare_groups
 from pipeline.datasets.pooled_tests import Difference, MeansTest, bound_levels, compare_means
 from pipeline.datasets.rank_tests import mann_whitney
 from pipeline.datasets.steps import find_changes
@@ -76,10 +76,38 @@ def test_intervals_over_runs_hold_the_truth(runs: int) -> None:
     assert 0.92 <= np.mean(hits) <= 0.97
 
 
-def compare_parts(sides: np.ndarray) -> float:
-    """p of two runs by their parts."""
-    parts = [np.log(Samples(side, side.size / RATE).parts) for side in sides]
-    return compare_means(parts, [(0, 1)]).differences[0].p
+def compare_parts(*sides: np.ndarray) -> float:
+    """p of two runs by their parts; 1 where they are not tested."""
+    (pair,) = compare_groups(
+        [
+            Group.of_runs(name, [Samples(side, side.size / RATE)])
+            for name, side in zip("ab", sides, strict=True)
+        ]
+    )
+    return 1.0 if pair.p is None else pair.p
+
+
+@pytest.mark.parametrize(
+    ("memory", "shorter"),
+    [
+        (2.0, 30.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in ((0.5, 30.0), (0.5, 100.0), (2.0, 100.0), (2.0, 600.0))
+        ),
+    ],
+)
+def test_single_runs_of_unequal_lengths_keep_the_level(memory: float, shorter: float) -> None:
+    rng = np.random.default_rng(round(shorter))
+    repetitions = 400
+    false = []
+    for _ in range(repetitions):
+        sides = [
+            simulate_runs(1, seconds=seconds, memory=memory, spread=0.0, rng=rng)[0]
+            for seconds in (600.0, shorter)
+        ]
+        false.append(compare_parts(*sides) <= 0.05)
+    assert np.mean(false) <= rejections_allowed(0.05, repetitions)[1]
 
 
 @pytest.mark.long
@@ -90,7 +118,7 @@ def test_blocks_of_single_runs_keep_the_level_that_plain_samples_break(memory: f
     blocks, plain = [], []
     for _ in range(repetitions):
         sides = simulate_runs(2, seconds=seconds, memory=memory, spread=0.0, rng=rng)
-        blocks.append(compare_parts(sides) <= 0.05)
+        blocks.append(compare_parts(*sides) <= 0.05)
         plain.append(mann_whitney(*sides) <= 0.05)
     assert np.mean(blocks) <= rejections_allowed(0.05, repetitions)[1]
     assert np.mean(plain) > 0.5
@@ -176,7 +204,7 @@ def test_long_nulls_at_every_memory() -> None:
         rejected = []
         for _ in range(repetitions):
             sides = simulate_runs(2, seconds=600.0, memory=memory, spread=0.0, rng=rng)
-            rejected.append(compare_parts(sides) <= 0.05)
+            rejected.append(compare_parts(*sides) <= 0.05)
         assert np.mean(rejected) <= rejections_allowed(0.05, repetitions)[1]
     for runs, attainable in ((4, 2 / 70), (5, 12 / 252)):
         found = [compare_once(runs, rng, seconds=120.0, memory=1.0).p <= 0.05 for _ in range(2_000)]
