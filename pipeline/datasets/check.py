@@ -430,12 +430,23 @@ def _compare_once(sides: Sides, limits: Limits | None, *, simulated: bool) -> Ch
     names = [name for name in sides.names if name not in COMMANDED]
     names += [MULTIPLIER] if _is_set_anew(sides) else []
 
+    turned = sides.names.index(MULTIPLIER)
+    counts = {
+        side: sum(bool(one.numbers.known[turned]) for one in runs)
+        for side, runs in ((BEFORE, sides.before), (AFTER, sides.after))
+    }
+
     def compare_named(some: Sequence[str]) -> list[Change]:
         places = [sides.names.index(name) for name in some]
 
         def pick(one: RunReading) -> RunNumbers:
-            values, covariance = one.numbers.values[places], one.numbers.covariance[np.ix_(places, places)]
-            return replace(one.numbers, values=values, covariance=covariance)
+            numbers = one.numbers
+            covariance = numbers.covariance.copy()
+            # The error of a multiplier is that of its side, whose mean it stays.
+            covariance[turned, turned] *= max(counts[numbers.side], 1)
+            return replace(
+                numbers, values=numbers.values[places], covariance=covariance[np.ix_(places, places)]
+            )
 
         return compare_sides(
             [pick(one) for one in (*sides.before, *sides.after)],

@@ -1,5 +1,6 @@
 """What a robot does of the body command: judged in a check, and told in the verdict on a run."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +10,9 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.changes import AFTER, BEFORE
+from pipeline.datasets.changes import AFTER, BEFORE, Side
 from pipeline.datasets.check import BROKEN, Check, check_as_json, compare
-from pipeline.datasets.check_readings import COMMANDED, MULTIPLIER
+from pipeline.datasets.check_readings import COMMANDED, MULTIPLIER, RunReading
 from pipeline.datasets.check_sides import Sides, read_under
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
@@ -86,6 +87,24 @@ def test_a_multiplier_that_stays_is_no_question(sides: Sides) -> None:
 
     assert not {*COMMANDED} & {*check.changes}
     assert "commanded rate" not in format_verdict(check)
+
+
+@pytest.mark.parametrize("runs", [1, 16])
+@pytest.mark.parametrize(("share", "status"), [(0.02, "unchanged"), (0.2, "changed")])
+def test_more_runs_do_not_make_two_percent_of_a_multiplier_a_change(
+    sides: Sides, runs: int, share: float, status: str
+) -> None:
+    index = sides.names.index(MULTIPLIER)
+
+    def turn(side: Side, by: float) -> tuple[RunReading, ...]:
+        (one,) = sides.before
+        values = one.numbers.values.copy()
+        values[index] += math.log1p(by)
+        return (replace(one, numbers=replace(one.numbers, side=side, values=values)),) * runs
+
+    check = compare(replace(sides, before=turn(BEFORE, 0.0), after=turn(AFTER, share)))
+
+    assert check.changes[MULTIPLIER].status == status
 
 
 def test_without_a_body_command_nothing_is_said_of_it(sides: Sides) -> None:
