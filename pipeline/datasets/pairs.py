@@ -260,12 +260,12 @@ def _test_units(
     A single run tells a spread by its own parts only, so that one with too few of them is not tested.
     """
     least = 1 if unit == RUNS else FEWEST_OF_SPREAD
-    tested = [place for place, own in enumerate(units) if own.size >= least]
-    asked = [pair for pair in pairs if {*pair} <= {*tested}]
-    values = [units[place] for place in tested]
+    valid = [index for index, own in enumerate(units) if own.size >= least]
+    asked = [pair for pair in pairs if {*pair} <= {*valid}]
+    values = [units[index] for index in valid]
     if not asked or not pool_spread(values)[1]:
         return None, {}
-    test = compare_means(values, [(tested.index(i), tested.index(j)) for i, j in asked], unit=unit)
+    test = compare_means(values, [(valid.index(i), valid.index(j)) for i, j in asked], unit=unit)
     return test, dict(zip(asked, test.differences, strict=True))
 
 

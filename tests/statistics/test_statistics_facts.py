@@ -120,15 +120,15 @@ def single(name: str, seconds: float, median: float = 1.0) -> Group:
 @pytest.mark.parametrize("seconds", [1.0, 8.0, 29.0])
 def test_runs_without_three_parts_are_not_tested(seconds: float) -> None:
     pairs = compare_groups([single("a", seconds), single("b", 600.0), single("c", 600.0, 2.0)])
-    short, other, tested = pairs
+    short, other, long = pairs
     for pair in (short, other):
         assert pair.p is None
         assert pair.ratio is not None
         assert "which takes 3 stretches of 10 s of each" in pair.note
     (alone,) = compare_groups([single("b", 600.0), single("c", 600.0, 2.0)])
-    assert tested.p == alone.p
-    assert tested.p is not None
-    assert tested.p < 0.01
+    assert long.p == alone.p
+    assert long.p is not None
+    assert long.p < 0.01
 
 
 def test_groups_that_do_not_scatter_are_not_tested() -> None:
