@@ -243,9 +243,9 @@ Ranked = tuple[float, DriveSource]
 def is_localization(topic: str) -> bool:
     """Whether a topic's name says that it localizes, and no later part of it that it is wheel odometry."""
     name = topic.lower()
-    if not (found := list(_LOCALIZED.finditer(name))):
+    if not (matches := list(_LOCALIZED.finditer(name))):
         return False
-    later = name[found[-1].end() :].partition("/")[2]
+    later = name[matches[-1].end() :].partition("/")[2]
     return not _ODOMETRY_OF_WHEELS.search(later)
 
 
