@@ -392,8 +392,6 @@ def key_stages(
     run: str, sha256: str, setup: LogSetup, inputs: tuple[str, ...], model: str | None = None
 ) -> dict[str, str]:
     """Key of every stage of a run, in order; ``model`` is the hash of the model for the residual slip."""
-    # The contracts import a table library that help and usage errors do not need.
-
     plain = msgspec.to_builtins(setup.configuration)
     pose_limits = {name: plain["velocity"][name] for name in ("jump_m", "jump_rad", "gap_s")}
     own = {

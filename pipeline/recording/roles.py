@@ -66,38 +66,38 @@ def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
         return
     of_role = (case.sources.rank_drives(role) for role in ("command", "wheels"))
     drives = {source.signals: source for sources in of_role for source in sources}
-    at = 0.5 * (motion.steps.start + motion.steps.end)
     for source in drives.values():
         reading = None
         if source.form is DriveForm.BODY and source.reason != CONFIGURED:
             reading = case.read(source, is_measured=True)
-        if reading is None or reading.first is None or reading.third is None or not reading.third.moves:
-            continue
-        if not reading.first.times.size:
-            text = f"not used: {source}: it has no number for the speed ahead"
-            case.findings.append(Finding("numbers_not_used", "info", text, where=source.signals[0].topic))
-            case.leave_out(source)
-            continue
-        last = np.searchsorted(reading.first.times, at, side="right") - 1
-        velocity = np.interp(at, reading.first.times, reading.first.values) + 1j * np.interp(
-            at, reading.third.times, reading.third.values
-        )
-        velocity, headings = velocity[last >= 0], [motion.middle[last >= 0]]
-        if reading.second is not None and reading.second.moves:
-            # An odometry has a heading of its own.
-            turned = np.cumsum(reading.second.values[:-1] * np.diff(reading.second.times))
-            headings.append(np.interp(at[last >= 0], reading.second.times[1:], turned))
-        power = max(float(np.sum(np.abs(velocity) ** 2)), 1e-12)
-        turns = [1.0, *(np.exp(-1j * heading) for heading in headings)]
-        lines = [abs(np.sum((velocity * turn) ** 2)) / power for turn in turns]
-        if lines[0] < ONE_LINE < max(lines[1:]):
-            text = (
-                f"not used: {source}: its velocities are along the axes of a map, and not ahead and to the "
-                "left of the body"
-            )
+        if reading is not None and (why := _explain_of_ground(reading, motion)):
+            text = f"not used: {source}: {why}"
             case.findings.append(Finding("numbers_not_used", "info", text, where=source.signals[0].topic))
             case.leave_out(source)
     case.moves_sideways = given.may_move_sideways(case.sources)
+
+
+def _explain_of_ground(reading: Reading, motion: Motion) -> str:
+    """Why the velocities of a reading say nothing of a body that moves sideways; empty where they may."""
+    ahead, aside, turning = reading.first, reading.third, reading.second
+    if ahead is None or aside is None or not aside.moves:
+        return ""
+    if not ahead.times.size:
+        return "it has no number for the speed ahead"
+    at = 0.5 * (motion.steps.start + motion.steps.end)
+    known = np.searchsorted(ahead.times, at, side="right") > 0
+    at, headings = at[known], [motion.middle[known]]
+    velocity = np.interp(at, ahead.times, ahead.values) + 1j * np.interp(at, aside.times, aside.values)
+    if turning is not None and turning.moves:
+        # An odometry has a heading of its own.
+        turned = np.cumsum(turning.values[:-1] * np.diff(turning.times))
+        headings.append(np.interp(at, turning.times[1:], turned))
+    power = max(float(np.sum(np.abs(velocity) ** 2)), 1e-12)
+    turns = [1.0, *(np.exp(-1j * heading) for heading in headings)]
+    lines = [abs(np.sum((velocity * turn) ** 2)) / power for turn in turns]
+    if lines[0] < ONE_LINE < max(lines[1:]):
+        return "its velocities are along the axes of a map, and not ahead and to the left of the body"
+    return ""
 
 
 def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading | None:

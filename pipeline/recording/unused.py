@@ -59,7 +59,7 @@ def list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
     missing = {role for role in ("command", "wheels") if getattr(sources, role) is None}
     sides = list(_list_sides(unknown))
     for role in sorted(missing):
-        findings += islice((one for one in sides if one.text.find(f"[{role}]") >= 0), _MOST)
+        findings += islice((finding for of, finding in sides if of == role), _MOST)
     if "command" in missing:
         findings += islice(_list_commands(unknown, index), _MOST)
     return findings
@@ -94,8 +94,8 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
     return findings
 
 
-def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[Finding]:
-    """Pairs of numbers that are named as those of left and right wheels, of unknown types."""
+def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[tuple[str, Finding]]:
+    """Pairs of numbers that are named as those of left and right wheels, of unknown types, by role."""
     numbers = {f"{topic}.{path}": topic for topic, paths in unknown.items() for path in paths}
     for left, topic in numbers.items():
         right, lower = _LEFT.sub(_name_right, left), left.lower()
@@ -109,7 +109,7 @@ def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[Finding]:
             f"not used: {left} and {right}, whose meaning is not known; if they are the left and right "
             f"wheels, in run.toml: [{role}] left_topic = {_quote(left)}; right_topic = {_quote(right)}{unit}"
         )
-        yield Finding("numbers_not_used", "warning", text, where=topic)
+        yield role, Finding("numbers_not_used", "warning", text, where=topic)
 
 
 def _quote(name: str) -> str:

@@ -122,15 +122,11 @@ def rate_poses(
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
     rated = [_find_copy(one, ratings) for one in ratings]
-    best, driven = (
-        rated[0],
-        {signal.topic for drive in sources.rank_drives("wheels") for signal in drive.signals},
-    )
+    best = rated[0]
+    driven = {signal.topic for drive in sources.rank_drives("wheels") for signal in drive.signals}
     for number, one in enumerate(rated[1:], start=1):
-        if not best.from_wheels and one.source.topic in driven:
-            of_best = _round_positions(best)
-            if len(of_best & _round_positions(one)) > _COPIED * max(len(of_best), 1):
-                rated[number] = replace(one, same_as=str(best.source))
+        if not best.from_wheels and one.source.topic in driven and _are_copies(best, one):
+            rated[number] = replace(one, same_as=str(best.source))
     return tuple(replace(one, position=None) for one in rated)
 
 
@@ -143,12 +139,17 @@ def _find_copy(rating: PoseRating, ratings: Sequence[PoseRating]) -> PoseRating:
     reckoned = [one for one in ratings if one is not rating and DEAD_RECKONED.search(str(one.source).lower())]
     if not reckoned or not _ODOMETRY_FRAME.search(rating.parent.lower()):
         return rating
-    own = _round_positions(rating)
     for other in reckoned:
-        if len(own & _round_positions(other)) > _COPIED * len(own):
+        if _are_copies(rating, other):
             reason = f"the same positions as {other.source}, by its name an odometry of the wheels"
             return replace(rating, from_wheels=True, same_as=str(other.source), reason=reason)
     return rating
+
+
+def _are_copies(one: PoseRating, other: PoseRating) -> bool:
+    """Whether another candidate has the positions of one; none of one that is refused."""
+    own = _round_positions(one)
+    return len(own & _round_positions(other)) > _COPIED * len(own)
 
 
 def _round_positions(rating: PoseRating) -> set[tuple[float, ...]]:
