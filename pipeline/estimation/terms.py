@@ -49,6 +49,9 @@ _SHAPES: Mapping[str, tuple[str, str]] = {
     "world_two": ("(a * sin(2 * yaw) + b * cos(2 * yaw)) * tanh(abs(v0) / u)", "1"),
     "speed_world": ("v0 * (a * sin(yaw) + b * cos(yaw))", "m/s"),
     "turn_world": ("w0 * (a * sin(yaw) + b * cos(yaw))", "rad/s"),
+    # Once a turn of a wheel, which is out of round or sits off its centre.
+    "left_wheel": ("left * (a * sin(left_angle) + b * cos(left_angle))", "rad/s"),
+    "right_wheel": ("right * (a * sin(right_angle) + b * cos(right_angle))", "rad/s"),
 }
 _SIDEWAYS_SHAPES: Mapping[str, tuple[str, str]] = {
     "sideways_gain": ("s0", "m/s"),

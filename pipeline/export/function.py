@@ -240,14 +240,19 @@ def _number(value: float) -> str:
 
 
 def _write_formula(effect: FormulaEffect) -> _Step:
-    lines = []
+    used = frozenset[str]().union(*(expression.names for expression in effect.expressions.values()))
+    # An id may hold what the name of a variable may not.
+    own = "".join(c if c.isascii() and (c.isalnum() or c == "_") else f"_{ord(c):x}" for c in effect.id)
+    turned = used & {"left_angle", "right_angle"}
+    states = {name: f"{name}_{own}" for name in sorted(turned)}
+    lines = [f"{state} += {name.removesuffix('_angle')} * step_s" for name, state in states.items()]
     for channel, expression in effect.expressions.items():
         if any(name.endswith("_rate") for name in expression.names):
             what = f"{effect.id} uses the rate of a signal, which the exported function does not have"
             hint = "Export without it (slip model drop)."
             raise MotionError("not_exportable", what, where=effect.id, hint=hint)
-        lines.append(f"{channel} = {channel} + ({_write(expression, effect.values, {})})")
-    return _Step("\n".join(lines))
+        lines.append(f"{channel} = {channel} + ({_write(expression, effect.values, states)})")
+    return _Step("\n".join(lines), tuple(states.values()))
 
 
 def _write(expression: Expression, values: Mapping[str, Floats | float], names: Mapping[str, str]) -> str:

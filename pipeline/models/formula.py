@@ -54,9 +54,12 @@ _BASE_UNITS = {name: unit for name, (unit, _) in _SIGNALS.items()}
 SIGNAL_UNITS: Mapping[str, str] = {
     **_BASE_UNITS,
     **{f"{name}_rate": f"{unit}/s" if "/" not in unit else f"{unit}^2" for name, unit in _BASE_UNITS.items()},
+    "left_angle": "rad",
+    "right_angle": "rad",
     "t": "s",
 }
-"""Signals that a formula may use, and their units; ``<name>_rate`` is the time derivative."""
+"""Signals that a formula may use, and their units; ``<name>_rate`` is the time derivative, ``<side>_angle``
+what a wheel has turned since the start of the run."""
 
 _TAKEN = {"id", "note", "pi", "self", "name", "formulas", "parameters", "fixed", "where"}
 """Names with another meaning in a model file or in the effect itself."""
@@ -206,6 +209,9 @@ def _parse_signal_units() -> Mapping[str, Unit]:
 def _read(now: _Driven, name: str) -> Floats:
     if name == "t":
         return now.context.times
+    if name in ("left_angle", "right_angle"):
+        speed: Floats = getattr(now.rolling.wheels, name.removesuffix("_angle"))
+        return np.cumsum(speed) * now.context.step_s
     if name in _SIGNALS:
         return _SIGNALS[name][1](now)
     rate = np.gradient(_SIGNALS[name.removesuffix("_rate")][1](now)) / now.context.step_s

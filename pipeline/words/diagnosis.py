@@ -81,7 +81,15 @@ _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
 """Detection limits that are listed, the smallest ones."""
 _VALUE = re.compile(r'^(\w+) = \{ value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
-_IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
+_IDEAL = {
+    "v0": "ideal forward speed",
+    "s0": "ideal lateral speed",
+    "w0": "ideal yaw rate",
+    "left": "speed of the left wheels",
+    "right": "speed of the right wheels",
+    "left_angle": "angle that they have turned",
+    "right_angle": "angle that they have turned",
+}
 """Inputs of formulas in words."""
 _FINDINGS_SHOWN = 3
 """Distinct findings that are shown by default; the others are counted, and shown with `--all`."""
@@ -236,8 +244,7 @@ def _list_rest(run: RunDiagnosis) -> list[str]:
 
 def list_terms(rest: Unexplained) -> list[str]:
     """The terms of a suggested formula, with its numbers and inputs in words."""
-    terms = [line for line in _list_formula(rest.formula or "") if len(line) <= _LONGEST_TERM]
-    return [f"suggested term: {line}" for line in terms]
+    return [f"suggested term: {line}" for line in _list_formula(rest.formula or "")]
 
 
 def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
@@ -378,11 +385,12 @@ def _list_formula(text: str) -> Iterator[str]:
     """Each term of a formula as model files have it, with its numbers, and its inputs in words."""
     numbers = [(name, f"{float(value):.3g} {unit}") for name, value, unit in _VALUE.findall(text)]
     for line in text.splitlines():
-        if line.startswith("v_"):
+        text = line.replace('"', "")
+        if line.startswith("v_") and len(text) <= _LONGEST_TERM:
             names = set(re.findall(r"\w+", line))
             known = [f"{name} = {value.removesuffix(' 1')}" for name, value in numbers if name in names]
             known += [f"{name} the {words}" for name, words in _IDEAL.items() if name in names]
-            yield ", ".join([line.replace('"', ""), *known])
+            yield ", ".join([text, *known])
 
 
 def format_suggestion(rest: Unexplained) -> str:

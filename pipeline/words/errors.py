@@ -1,6 +1,7 @@
 """Errors of a model as text: their size, where and when they arise, what remains, and the ladder."""
 
 import math
+import re
 from collections.abc import Sequence
 
 from pipeline.core import (
@@ -55,6 +56,12 @@ REGIONS = {
     "y_below": "where y <= {0:.1f} m in the map",
 }
 """Regions in words, with their limits."""
+_REPEATS = {
+    "left_angle": "with every turn of the left wheel",
+    "right_angle": "with every turn of the right wheel",
+    "yaw": "with the heading in the map",
+}
+"""What the inputs of a formula say of where the error comes from."""
 _KNOWN_TO = 1.2  # factor to which a noise floor is known: nine of ten drawn logs are within it
 # A larger share is rounded to more than 100 %: the error is below the noise floor.
 _WHOLE = 1.005
@@ -179,7 +186,10 @@ def format_remaining_error(error_m: float, floor_m: float, explained: float) -> 
 def describe_structure(rest: Unexplained) -> str:
     """On what the structure of the residual depends."""
     if rest.kind == "formula":
-        return f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
+        names = set(re.findall(r"\w+", rest.formula or ""))
+        repeats = [words for name, words in _REPEATS.items() if name in names]
+        text = f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
+        return ": ".join([text, *([f"it repeats {enumerate_texts(repeats)}"] if repeats else [])])
     if rest.kind == "learned":
         matters = (
             f"; {rest.of} matters {rest.times:.0f} times as much as any other"

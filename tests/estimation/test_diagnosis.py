@@ -239,6 +239,17 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     assert "would remain over 2 s" in describe([run])
 
 
+def test_a_wheel_out_of_round_is_told_by_what_it_has_turned(tmp_path: Path) -> None:
+    def wobble(state: State) -> tuple[float, float, float]:
+        missed = 0.06 * math.sin(state.right_angle) * _SCENE.vehicle.wheel_radius_m * state.right_speed
+        return 0.5 * missed, 0.0, missed / _SCENE.vehicle.track_width_m
+
+    (run,) = _diagnose(replace(_SCENE, extra=wobble), tmp_path).runs
+    assert run.effects == ()
+    assert run.unexplained is not None
+    assert "it repeats with every turn of the right wheel" in describe_structure(run.unexplained)
+
+
 @pytest.mark.long
 def test_motion_that_lasts_is_unexplained_and_its_own_past_predicts_it(tmp_path: Path) -> None:
     pushed = Disturbance(0.1, 0.15, correlation_s=4.0)

@@ -161,6 +161,21 @@ def test_a_power_of_a_negative_number_keeps_its_sign() -> None:
     assert rows[0, 4] == pytest.approx(1.25 * HUSKY.wheel_radius_m)
 
 
+def test_an_exported_formula_knows_what_a_wheel_has_turned() -> None:
+    gain = (make_parameter("k", "m", (-1.0, 1.0)),)
+    formulas = ("left * sin(left_angle)", "right * sin(left_angle - right_angle)")
+    effects = [
+        FormulaEffect(name, {"v_x": f"k * {text}"}, gain, k=0.01)
+        for name, text in zip(("hart-é", "hart_e9"), formulas, strict=True)
+    ]
+    source = export_model(ModelFile(Model(HUSKY, tuple(effects))), "python")
+    assert list_free_names(source) == set()
+    rows = run_exported(source, [(-1.0, 2.0, 3.0)], 4.0)
+    turned = np.arange(1, len(rows) + 1) * STEP_S
+    added = 0.02 * np.sin(2.0 * turned) + 0.03 * np.sin(-turned)
+    assert rows[:, 4] == pytest.approx(2.5 * HUSKY.wheel_radius_m + added, abs=1e-9)
+
+
 @pytest.fixture(scope="module")
 def runs() -> Mapping[str, MotionRun]:
     quiet = {"duration_s": 8.0, "encoders": None, "pose": QUIET, "disturbance": Disturbance()}

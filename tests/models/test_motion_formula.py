@@ -118,3 +118,18 @@ def test_rates_of_signals_can_be_used_and_are_nothing_across_holes() -> None:
     assert np.isfinite(shaken).all()
     assert np.abs(shaken - ideal)[:, 0].max() > 0.01
     assert np.array_equal(shaken[:, 2], ideal[:, 2])
+
+
+def test_a_wheel_out_of_round_is_a_formula_of_what_it_has_turned() -> None:
+    husky = vehicle_of("husky_a200")
+
+    def wobble(state: SimulatedState) -> tuple[float, float, float]:
+        return 0.05 * husky.wheel_radius_m * state.left_speed * math.sin(state.left_angle), 0.0, 0.0
+
+    run = simulate({}, extra=wobble, duration_s=60.0)
+    text = "left * (a * sin(left_angle) + b * cos(left_angle))"
+    parameters = tuple(make_parameter(name, "m", (-0.1, 0.1)) for name in "ab")
+    problem = Problem([run], husky, Input.MEASURED)
+    fitted = fit_model(problem, Model(husky, (FormulaEffect("oval", {"v_x": text}, parameters),)))
+    size = math.hypot(*fitted.model.effect("oval").values.values())
+    assert size == pytest.approx(0.05 * husky.wheel_radius_m, rel=0.1)
