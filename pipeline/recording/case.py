@@ -25,7 +25,7 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.stages import CommandTimeout, Extraction, Finding, find_sideways_share
+from pipeline.stages import Extraction, Finding, find_sideways_share
 
 TAKEN_M = 0.1
 """Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
@@ -152,7 +152,6 @@ class Case:
             self.extraction = Extraction(given.data, equal, by_log, self.vehicle, given.where)
         self.moves_sideways = given.may_move_sideways(self.sources)
         self.driven: Explained | None = None
-        self.timeout: CommandTimeout | None = None
         # Whether what is commanded has a unit, so that the controller's lengths can be told from it.
         self.is_scaled = True
 

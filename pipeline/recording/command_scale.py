@@ -1,4 +1,4 @@
-"""Corrections of the recorded commands by what the drive does of them: scale, multiplier, and time-out.
+"""Corrections of the recorded commands by what the drive does of them: scale and multiplier.
 
 Commands and wheels are ideal velocities of the body. The wheels follow the command with a lag and a delay
 that are fitted; what remains is a factor, which is that of slow driving: there the drive does not saturate.
@@ -15,12 +15,11 @@ import polars as pl
 from pipeline.core import Flags, Floats, SlipError, fit_robustly, robust_spread
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
-from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import Vehicle, list_presets
-from pipeline.stages import ONE_SCALE, Finding, find_timeout, report_timeout
+from pipeline.stages import ONE_SCALE, Finding
 
 _LEAST_RATIO = 0.02
 """Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
@@ -235,16 +234,15 @@ def _take_as_followed(case: Case, command: Candidate, alignment: Alignment) -> A
 
 
 def measure_command(
-    case: Case, command: Candidate | None, wheels: Candidate | None, kind: str, motion: Motion | None
+    case: Case, command: Candidate | None, wheels: Candidate | None, kind: str
 ) -> Alignment | None:
-    """Corrections of the command as it is read with all others; its time-out goes into the configuration.
+    """Corrections of the command as it is read with all others.
 
     Args:
         case: the log; its wheels may have explained the command.
         command: the candidate for it.
         wheels: the candidate for them.
         kind: of the vehicle, if its signals show it.
-        motion: of the poses; None where wheels stand in for them.
     """
     if command is None:
         return None
@@ -270,16 +268,6 @@ def measure_command(
             asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
         )
         case.findings += findings
-    rates = motion.rates if got.is_empty() and motion is not None else None
-    if rates is None and not got.is_empty():
-        rates = roll(got, vehicle)
     if is_body and not case.is_scaled and command.reading.explained is not None:
         alignment = _take_as_followed(case, command, alignment)
-    # Stops that were asked for tell it best, where there are any.
-    timeout = None if rates is None else find_timeout(*rates, asked, vehicle)
-    timeout = timeout or case.timeout
-    if timeout is not None:
-        hold_s = made.command.hold_s or timeout.seconds
-        case.changes.setdefault("command", {})["hold_s"] = hold_s
-        case.findings.append(report_timeout(timeout, hold_s))
     return alignment

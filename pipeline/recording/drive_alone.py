@@ -100,7 +100,7 @@ def _stand_in(case: Case) -> Recording | None:
     case.driven = explain_wheels(command.reading, wheels.reading)
     settle_delay(case, command, wheels, None)
     sources = replace(case.sources, command=command.source)
-    alignment = measure_command(case, command, wheels, "ackermann" if steered else "", None)
+    alignment = measure_command(case, command, wheels, "ackermann" if steered else "")
     return Recording(
         _replace_pose(sources, wheels.source),
         case.complete(),

@@ -130,7 +130,7 @@ def examine(given: Given) -> Recording:
     find_units(case, command, wheels)
     settle_delay(case, command, wheels, motion)
     report_mounting(case, (wheels, command))
-    alignment = measure_command(case, command, wheels, kind, motion)
+    alignment = measure_command(case, command, wheels, kind)
     used = (("command", command), ("wheels", wheels))
     roles = {id(one.reading): role for role, one in used if one is not None}
     roles |= {id(gyro): "gyro"} if gyro is not None else {}

@@ -1,126 +1,216 @@
-"""How long a command is held where no other follows: many drives stop by themselves after a time-out."""
+"""How long a command is held where no other follows: many drives stop by themselves after a time-out.
+
+The time from the last command to half the speed is the time-out and the response time of the drive. That is
+measured where the drive is told to stop, or, if it never is, where it starts.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import NORMAL_95, Flags, Floats
+from pipeline.core import NORMAL_95, Floats, Ints, fit_robustly, robust_spread
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import Motion
-from pipeline.recording.readings import GRID_S, SIDES, Bent, Explained, Held, Reading
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, compare
-from pipeline.stages import CommandTimeout
+from pipeline.recording.readings import GRID_S, SIDES, Bent, Held, Reading
+from pipeline.run import LIVE_SHARE
+from pipeline.stages import Finding
 
 _PERIODS = 3.0
 """Gap in the commands [usual periods] above which they are silent: a shorter one is jitter."""
+_STEADY_S = 0.5
+"""Time [s] of steady commands and speed before a stop; otherwise the speed falls for another reason."""
+_ALIKE = 0.1
+"""Largest relative variation of a steady speed."""
+_LONGEST_S = 4.0
+"""Time [s] for which the speed is observed after a stop: drives reach half of it in less."""
+_HOLE = 1.5
+"""Distance of two steps of the motion [usual ones] that may hide a stop."""
 _FEWEST = 3
-"""Least number of silences: one or two are chance."""
-_BEFORE_S = 5.0
-"""Time [s] before a silence, and in it, in which it shows what the drive does of commands."""
-_AFTER_S = 2.0
-"""The same after it [s]."""
-_DELAYS_S = np.arange(-0.1, 0.41, 0.1)
-"""Delays that are tried [s]."""
-_STOPPED = 0.5
-"""Motion over what is asked in the second half of silences, over that of driving, of a drive that stops."""
-_TRIES = 6
-"""Time-outs that are tried first, from the usual period to the longest silence."""
-_FINE_S = 0.02
-"""Step between those that are tried last [s]."""
+"""Least number of silences, and of ordinary stops, for a typical value; and of steps of a steady speed."""
+_OBEYED = 0.8
+"""Least fraction of long silences in which the base stops: otherwise unrecorded commands drive it."""
+_LATER_S = 0.3
+"""Time [s] beyond the longest stop after which a silence must show a stop."""
 _KNOWN = 0.3
 """Largest half-width of the interval, as a fraction of the time-out, that is reported."""
+_MOST = 400
+"""Number of stops that are evaluated: more add no information."""
 
 
-def settle_timeout(
-    case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion | None
-) -> None:
-    """Hold the command as long as what follows it does; `measure_command` tells how long.
+@dataclass(frozen=True)
+class CommandTimeout:
+    """Time after the last command at which the base begins to stop.
+
+    Attributes:
+        seconds: the time.
+        low, high: its 95 % interval [s].
+        silences: number of stops used.
+    """
+
+    seconds: float
+    low: float
+    high: float
+    silences: int
+
+
+def settle_timeout(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> None:
+    """Hold the command as long as what follows it does.
 
     Args:
         case: the log.
         command: the candidate for the command, whose reading is replaced.
         wheels: that for the wheels, which show it best.
-        motion: of the poses; None where wheels stand in for them.
+        motion: of the poses, or of the wheels that stand in for them.
     """
     if command is None:
         return
-    follows = motion
+    rolled = None
     if wheels is not None and len(wheels.reading.inputs) == len(SIDES) and wheels.reading.form != "steering":
-        follows = roll_wheels(wheels.reading) or motion
-    timeout = None if follows is None else find_by_silences(command.reading, follows)
+        rolled = roll_wheels(wheels.reading)
+    is_sides = rolled is not None and wheels is not None and wheels.reading.form == "sides"
+    width = 1.0 if is_sides else case.vehicle.kinematics.turning_width_m(case.vehicle)
+    timeout = find_timeout(command.reading, rolled or motion, 0.5 * width)
     if timeout is None:
         return
-    case.timeout = timeout
-    command.reading = hold(command.reading, case.configuration.command.hold_s or timeout.seconds)
-    if motion is not None:
-        command.reading.explain(motion)
+    hold_s = case.configuration.command.hold_s or timeout.seconds
+    case.changes.setdefault("command", {})["hold_s"] = hold_s
+    case.findings.append(_report(timeout, hold_s))
+    command.reading = hold(command.reading, hold_s)
+    command.reading.explain(motion)
 
 
-def find_by_silences(reading: Reading, motion: Motion) -> CommandTimeout | None:
-    """The time-out with which a motion follows a command best; None if it follows it as well throughout.
+def _report(timeout: CommandTimeout, hold_s: float) -> Finding:
+    said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
+    held = "commands are held for this time"
+    if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
+        held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
+    text = f"the base begins to stop {said} after the last command (from {timeout.silences} pauses): {held}"
+    return Finding(
+        "command_timeout", "info", text, where="command", value=timeout.seconds, count=timeout.silences
+    )
+
+
+def find_timeout(reading: Reading, motion: Motion, lever: float) -> CommandTimeout | None:
+    """Time-out of a base; None if its silences do not show one.
 
     Args:
         reading: the command.
-        motion: of the wheels, or of the body.
+        motion: of the wheels, or of the body, in any unit.
+        lever: half the width of the vehicle, in that unit.
     """
-    gaps, near = _find_silences(reading, motion)
-    throughout = hold(reading, np.inf).explain(motion.take(near), _DELAYS_S) if gaps.size else None
-    if throughout is None:
+    if not reading.inputs or reading.inputs[0].times.size < _FEWEST:
         return None
-    part, crossed, usual = throughout.motion, throughout.crossed, _find_period(reading)
-
-    tried: dict[float, Explained] = {}
-
-    def rate(some: Floats) -> float:
-        for one in np.round(some, 3).tolist():
-            if one not in tried and one > usual:
-                tried[one] = hold(reading, one).fit_to(part, _DELAYS_S, crossed=crossed)
-        return max(tried, key=lambda one: float(tried[one].blocks.sum()))
-
-    grid = np.geomspace(1.5 * usual, float(gaps.max()), _TRIES)
-    best = rate(grid)
-    if compare(tried[best].blocks, throughout.blocks) < CLEAR:
+    run = _Run(reading, motion, lever)
+    silences = run.find_silences()
+    ordinary = run.find_stops() if silences.size else silences
+    if silences.size and len(ordinary) < _FEWEST:
+        ordinary = run.find_starts()
+    if len(ordinary) < _FEWEST:
         return None
-    best = rate(best * (grid[1] / grid[0]) ** np.array([-0.6, -0.3, 0.3, 0.6]))
-    for _ in range(2):
-        best = rate(best + _FINE_S * np.arange(-3.0, 4.0))
-    likely = [one for one in tried if compare(tried[best].blocks, tried[one].blocks) < NORMAL_95]
-    low, high = min(likely) - 0.5 * _FINE_S, max(likely) + 0.5 * _FINE_S
-    is_known = 0.5 * (high - low) <= _KNOWN * best
-    return CommandTimeout(best, low, high, int((gaps > best).sum())) if is_known else None
+    # The duration of a ramp depends on the speed, that of a lag does not: compare stops at the same speed.
+    both: Floats = np.concatenate((ordinary, silences))
+    is_silent = np.arange(len(both)) >= len(ordinary)
+    design: Floats = np.column_stack((is_silent, np.ones(len(both)), both[:, 1]))
+    (seconds, _, _), rest = fit_robustly(design, both[:, 0])
+    least = run.step / math.sqrt(12.0)
+    share = float(np.linalg.pinv(design.T @ design)[0, 0])
+    half = NORMAL_95 * max(robust_spread(rest), least) * math.sqrt(share)
+    if not half <= _KNOWN * seconds:
+        return None
+    return CommandTimeout(float(seconds), float(seconds - half), float(seconds + half), len(silences))
 
 
-def _find_silences(reading: Reading, motion: Motion) -> tuple[Floats, Flags]:
-    """Lengths of the silences in which something is asked [s], and the steps near them.
+class _Run:
+    """What a drive is asked, and how fast its fastest side moves; see `find_timeout`."""
 
-    There are none of too few, or where the motion goes on as it was asked to before.
-    """
-    steps = motion.steps
-    nothing = np.zeros(0), np.zeros(steps.start.size, dtype=bool)
-    if not reading.inputs:
-        return nothing
-    times = reading.inputs[0].times
-    asked = np.any([one.values != 0.0 for one in reading.inputs if one.times.size == times.size], axis=0)
-    gaps = np.diff(times)
-    silent = np.flatnonzero((gaps > _PERIODS * _find_period(reading)) & asked[:-1])
-    if silent.size < _FEWEST:
-        return nothing
-    begins = times[silent] - _BEFORE_S
-    ends = np.minimum(times[silent + 1], times[silent] + _BEFORE_S) + _AFTER_S
-    at = np.searchsorted(begins, steps.end, side="right") - 1
-    near = (at >= 0) & (steps.end < ends[at])
-    if near.sum() < FEWEST_STEPS:
-        return nothing
-    asked_there = np.abs(np.column_stack(reading.columns(steps, 0.0, 0.0, crossed=False)))
-    moved = np.abs(np.column_stack([motion.body.real, motion.yaw]))
-    of = np.maximum(np.searchsorted(times[silent], steps.start, side="right") - 1, 0)
-    since = steps.start - times[silent][of]
-    late = (since > 0.5 * gaps[silent][of]) & (since + steps.end - steps.start < gaps[silent][of])
-    shares = [moved[rows].sum(axis=0) / (asked_there[rows].sum(axis=0) + 1e-9) for rows in (late, ~late)]
-    return (gaps[silent], near) if (shares[0] < _STOPPED * shares[1]).all() else nothing
+    def __init__(self, reading: Reading, motion: Motion, lever: float) -> None:
+        self.stamps = reading.inputs[0].times
+        inputs = [one for one in reading.inputs if one.times.size == self.stamps.size]
+        asked = np.column_stack([np.where(one.live, one.values, 0.0) for one in inputs])
+        self.asked = asked / np.maximum(np.sqrt(np.mean(asked**2, axis=0)), 1e-9)
+        self.size = np.linalg.norm(self.asked, axis=1)
+        self.live = self.size > LIVE_SHARE * float(np.quantile(self.size, 0.95))
+        self.quiet = np.diff(self.stamps) > _PERIODS * _find_period(reading)
+        self.times, velocity = motion.rates
+        self.speed = np.abs(velocity[:, 0]) + lever * np.abs(velocity[:, 2])
+        self.step = float(np.median(np.diff(self.times)))
+
+    def find_silences(self) -> Floats:
+        """Times from last commands to half the speed [s], and the speed before, shape (k, 2).
+
+        There are none if they are too few, or the base goes on.
+        """
+        last = np.flatnonzero(self.quiet & self.live[:-1])
+        ends = np.minimum(self.stamps[last + 1], self.stamps[last] + _LONGEST_S)
+        halves = self._watch_stops(last, self.stamps[last], ends)
+        known = np.isfinite(halves[:, 0])
+        longest = float(np.max(halves[known, 0], initial=0.0)) + _LATER_S
+        goes_on = np.isinf(halves[:, 0]) & (ends - self.stamps[last] > longest)
+        is_obeyed = known.sum() >= max(_FEWEST, _OBEYED * (known.sum() + goes_on.sum()))
+        return halves[known] if is_obeyed else halves[:0]
+
+    def find_stops(self) -> Floats:
+        """The same from the first command of zero on."""
+        last = np.flatnonzero(~self.quiet & self.live[:-1] & (self.size[1:] == 0.0))
+        starts, on = self.stamps[last + 1], np.append(self.stamps[self.size > 0.0], np.inf)
+        ends = np.minimum(on[np.searchsorted(on, starts)], starts + _LONGEST_S)
+        halves = self._watch_stops(last, starts, ends)
+        return halves[np.isfinite(halves[:, 0])]
+
+    def _watch_stops(self, last: Ints, starts: Floats, ends: Floats) -> Floats:
+        """Times from starts to half the speed, infinite if it is not reached, NaN if they are not known."""
+        halves: Floats = np.full((last.size, 2), np.nan)
+        for at in range(0, last.size, max(last.size // _MOST, 1)):
+            row, start = int(last[at]), float(starts[at])
+            if self.stamps[row] - self._follow(row, -1) >= _STEADY_S:
+                halves[at] = self._find_half(start, float(ends[at]), start)
+        return halves
+
+    def find_starts(self) -> Floats:
+        """The same from the first command after a rest on, by the speed that it leads to."""
+        first = 1 + np.flatnonzero((self.quiet | (self.size[:-1] == 0.0)) & self.live[1:])
+        halves: Floats = np.full((first.size, 2), np.nan)
+        for at in range(0, first.size, max(first.size // _MOST, 1)):
+            start = float(self.stamps[first[at]])
+            until = min(self._follow(int(first[at]), 1), start + _LONGEST_S)
+            if until - start >= 2.0 * _STEADY_S:
+                halves[at] = self._find_half(start, until, until, rises=True)
+        return halves[np.isfinite(halves[:, 0])]
+
+    def _follow(self, row: int, step: int) -> float:
+        """Stamp [s] of the last command before (step = -1) or after one up to which all are like it."""
+        end = int(np.searchsorted(self.stamps, self.stamps[row] + step * _LONGEST_S))
+        at = np.arange(row, min(end, self.stamps.size - 1) + step, step)
+        unlike = np.abs(self.asked[at] - self.asked[row]).max(axis=1) > _ALIKE * self.size[row]
+        unlike[1:] |= self.quiet[np.minimum(at[1:], at[:-1])]
+        return float(self.stamps[at[np.argmax(unlike) - 1] if unlike.any() else at[-1]])
+
+    def _find_half(
+        self, start: float, end: float, steady: float, *, rises: bool = False
+    ) -> tuple[float, float]:
+        """Time from a start to half the speed that is steady up to a time, and that speed."""
+        edges = np.searchsorted(self.times, (steady - _STEADY_S, steady, start, end))
+        first, last, now, stop = edges.tolist()
+        held = self.speed[first:last]
+        level = float(np.median(held)) if held.size >= _FEWEST else 0.0
+        if not now or not level or np.ptp(held) > 2.0 * _ALIKE * level:
+            return math.nan, math.nan
+        times, left = self.times[now - 1 : stop], self.speed[now - 1 : stop] / level - 0.5
+        left = -left if rises else left
+        over = np.flatnonzero(left < 0.0)
+        reached = int(over[0]) if over.size else times.size
+        seen = np.append(times, end)[: reached + 1]
+        if not reached or (np.diff(seen) > _HOLE * self.step).any():
+            return math.nan, math.nan
+        if not over.size:
+            return math.inf, level
+        before, after = times[reached - 1], times[reached]
+        share = left[reached - 1] / (left[reached - 1] - left[reached])
+        return float(before + share * (after - before) - start), level
 
 
 def _find_period(reading: Reading) -> float:

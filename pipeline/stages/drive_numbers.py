@@ -1,7 +1,6 @@
-"""What a log tells of the drive beside slip: power, command time-out and late starts.
+"""What a log tells of the drive beside slip: power and late starts.
 
-Power over time with energy per distance; how long the base moves after its last command, from gaps in the
-command topic; how late the drive follows its first command after a stop or a gap.
+Power over time with energy per distance; how late the drive follows its first command after a stop or a gap.
 """
 
 import math
@@ -13,7 +12,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import (
-    NORMAL_95,
     PERIODS,
     ROUNDING_S,
     SILENT_S,
@@ -32,7 +30,6 @@ from pipeline.stages import reading
 from pipeline.stages.clocks import TopicClock
 from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import hold_commands, interpolate_wheels
-from pipeline.stages.spans import LIVE
 
 _HALF_S: Final = 0.5
 """Half the span over which speed is measured [s]: a longer one would cut corners in turns."""
@@ -117,177 +114,6 @@ def _describe(source: PowerSource, current: Floats, per_metre: Floats) -> Findin
     return Finding("power_drawn", "info", f"{text} ({source.reason})", where=str(source), value=median)
 
 
-# A base without commands stops by itself. The time from its last command to half its speed is the timeout
-# plus the response time of the drive, which is measured at commanded stops.
-
-_PERIODS = 3.0
-"""Gap in the commands [usual periods] above which they are silent: a shorter one is jitter."""
-_STEADY_S = 0.5
-"""Time [s] of steady commands and speed before a stop; otherwise the speed falls for another reason."""
-_ALIKE = 0.1
-"""Largest relative variation of a steady speed."""
-_LONGEST_S = 4.0
-"""Time [s] for which the speed is observed after a stop: drives reach half of it in less."""
-_HOLE_S = 0.15
-"""Gap between samples of the grid [s] that may hide a stop."""
-_FEWEST = 3
-"""Least number of silences, and of ordinary stops, for a typical value; and of late starts, to be told."""
-_OBEYED = 0.8
-"""Least fraction of long silences in which the base stops: otherwise unrecorded commands drive it."""
-_LATER_S = 0.3
-"""Time [s] beyond the longest stop after which a silence must show a stop."""
-_KNOWN = 0.3
-"""Largest half-width of the interval, as a fraction of the timeout, that is reported."""
-_MOST = 400
-"""Number of stops that are evaluated: more add no information."""
-
-
-@dataclass(frozen=True)
-class CommandTimeout:
-    """Time after the last command at which the base begins to stop.
-
-    Attributes:
-        seconds: the time.
-        low, high: its 95 % interval [s].
-        silences: number of stops used.
-    """
-
-    seconds: float
-    low: float
-    high: float
-    silences: int
-
-
-def find_timeout(
-    times: Floats, velocity: Floats, commands: pl.DataFrame, vehicle: Vehicle
-) -> CommandTimeout | None:
-    """Timeout of a run.
-
-    Args:
-        times: increasing [s], shape (n,).
-        velocity: of the body at them, by measured wheels if available, else by poses, shape (n, 3).
-        commands: table `commands`.
-        vehicle: its track converts yaw rates to rim speeds.
-    """
-    if commands.is_empty():
-        return None
-    scale = _rims(vehicle)
-    stamps = commands["t"].to_numpy()
-    asked = hold_commands(stamps, commands, vehicle, math.inf)
-    return measure_timeout(
-        times,
-        np.abs(velocity * scale).sum(axis=1),
-        stamps,
-        np.where(asked.active, np.abs(asked.velocity * scale).sum(axis=1), 0.0),
-    )
-
-
-def measure_timeout(times: Floats, speed: Floats, stamps: Floats, asked: Floats) -> CommandTimeout | None:
-    """Timeout from gaps in the commands; None if they do not show one.
-
-    Args:
-        times: grid [s], shape (n,).
-        speed: of the fastest rim on it [m/s], NaN where unknown, shape (n,).
-        stamps: of the commands [s], in order, shape (m,).
-        asked: commanded speed of the fastest rim [m/s], shape (m,).
-    """
-    if times.size < 2 or stamps.size < 2 or not asked.any():  # noqa: PLR2004 - to differ
-        return None
-    live = asked > LIVE * float(np.quantile(asked[asked > 0.0], 0.95))
-    gap = np.diff(stamps)
-    quiet = gap > _PERIODS * max(float(np.quantile(gap, 0.75)), 1e-3)
-    silent = np.flatnonzero(quiet & live[:-1])
-    stopped = np.flatnonzero(~quiet & live[:-1] & (asked[1:] == 0.0))
-    if min(silent.size, stopped.size) < _FEWEST:
-        return None
-    on = np.append(stamps[asked > 0.0], np.inf)
-    until = on[np.searchsorted(on, stamps[stopped + 1])]
-    run = _Run(times, speed, stamps, asked)
-    ordinary = run.find_halves(stopped, stamps[stopped + 1], until)
-    halves = run.find_halves(silent, stamps[silent], stamps[silent + 1])
-    usual = halves[np.isfinite(halves[:, 0])]
-    both = np.concatenate((ordinary[np.isfinite(ordinary[:, 0])], usual))
-    if min(usual.shape[0], both.shape[0] - usual.shape[0]) < _FEWEST:
-        return None
-    longest = float(np.max(usual[:, 0])) + _LATER_S
-    goes_on = np.isinf(halves[:, 0]) & (np.minimum(gap[silent], _LONGEST_S) > longest)
-    if usual.shape[0] < _OBEYED * (usual.shape[0] + goes_on.sum()):
-        return None
-    # The duration of a ramp depends on the speed, that of a lag does not: compare stops at the same speed.
-    is_silent = np.arange(both.shape[0]) >= both.shape[0] - usual.shape[0]
-    design = np.column_stack((is_silent, np.ones(both.shape[0]), both[:, 1]))
-    (seconds, _, _), rest = fit_robustly(design, both[:, 0])
-    least = float(np.median(np.diff(times))) / math.sqrt(12.0)
-    share = float(np.linalg.pinv(design.T @ design)[0, 0])
-    half = NORMAL_95 * max(robust_spread(rest), least) * math.sqrt(share)
-    if not half <= _KNOWN * seconds:
-        return None
-    return CommandTimeout(seconds, seconds - half, seconds + half, usual.shape[0])
-
-
-def report_timeout(timeout: CommandTimeout, hold_s: float) -> Finding:
-    """Report the timeout and how long commands are held."""
-    said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
-    held = "commands are held for this time"
-    if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
-        held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
-    text = f"the base begins to stop {said} after the last command (from {timeout.silences} pauses): {held}"
-    return Finding(
-        "command_timeout", "info", text, where="command", value=timeout.seconds, count=timeout.silences
-    )
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A run's speed on its grid, and its commands; see `measure_timeout`."""
-
-    times: Floats
-    speed: Floats
-    stamps: Floats
-    asked: Floats
-
-    def find_halves(self, last: Ints, starts: Floats, ends: Floats) -> Floats:
-        """Times from starts to half the speed [s], and the speed [m/s], shape (k, 2).
-
-        The time is infinite if half the speed is not reached, and NaN if it cannot be determined.
-
-        Args:
-            last: the command before each start, shape (k,).
-            starts: earliest times of the stop [s], shape (k,).
-            ends: ends of the observation [s], shape (k,).
-        """
-        few = slice(None, None, max(last.size // _MOST, 1))
-        halves = np.full((last.size, 2), np.nan)
-        halves[few] = [
-            self._find_half(*one)
-            for one in zip(last[few].tolist(), starts[few].tolist(), ends[few].tolist(), strict=True)
-        ]
-        return halves
-
-    def _find_half(self, last: int, start: float, end: float) -> tuple[float, float]:
-        first = int(np.searchsorted(self.stamps, self.stamps[last] - _STEADY_S))
-        asked = self.asked[first : last + 1]
-        begin, now, stop = np.searchsorted(
-            self.times, (start - _STEADY_S, start, min(end, start + _LONGEST_S))
-        ).tolist()
-        times, speed = self.times[begin:stop], self.speed[begin:stop]
-        before = speed[: now - begin]
-        if asked.size < _FEWEST or np.ptp(asked) > _ALIKE * asked[-1] or before.size < _FEWEST:
-            return math.nan, math.nan
-        was = float(np.median(before))
-        if not np.ptp(before) <= 2.0 * _ALIKE * was:
-            return math.nan, math.nan
-        below = np.flatnonzero(~(speed >= 0.5 * was))
-        reached = int(below[0]) if below.size else times.size
-        seen = slice(0, reached + 1)
-        if not np.isfinite(speed[seen]).all() or (np.diff(times[seen]) > _HOLE_S).any():
-            return math.nan, math.nan
-        if not below.size:
-            return math.inf, was
-        share = (speed[reached - 1] - 0.5 * was) / (speed[reached - 1] - speed[reached])
-        return float(times[reached - 1] + share * (times[reached] - times[reached - 1]) - start), was
-
-
 # A drive that was stopped or released may follow its next command late, by a different delay each time: a
 # safety switch, a brake or a radio link comes first. That delay is no property of the motion.
 
@@ -309,6 +135,8 @@ _LATE_S = 0.15
 """Least lateness [s] that is corrected: twice the spread of other responses, 0.04 to 0.08 s on recordings."""
 _REGULAR = 0.2
 """Relative standard deviation of late starts below which they are a property of the drive, to be modelled."""
+_FEWEST = 3
+"""Least number of late starts, to be told."""
 _FEWEST_RESPONSES = 12
 """Least number of responses for the regression of five coefficients."""
 

@@ -7,7 +7,7 @@ import pytest
 from drawn_motion import draw, measured, tabulate
 
 from pipeline.recording.readings import Held, Reading
-from pipeline.recording.timeouts import find_by_silences, hold
+from pipeline.recording.timeouts import find_timeout, hold
 
 SILENT_S = 2000.0
 LONGEST_S = 1.0
@@ -38,4 +38,4 @@ def test_silences_of_half_an_hour_are_filled_in_a_moment(period_s: float, second
 def test_fewer_than_two_commands_have_no_silence(count: int) -> None:
     reading = Reading("body", "/cmd_vel", *(Held(np.zeros(count), np.ones(count)) for _ in range(2)))
     assert hold(reading, 0.5) is reading
-    assert find_by_silences(reading, measured(tabulate(draw()))) is None
+    assert find_timeout(reading, measured(tabulate(draw())), 0.5) is None

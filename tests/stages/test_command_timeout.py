@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from stage_logs import FIELD, TakeThrough
+from stage_logs import FIELD, Taken, TakeThrough
 
 from pipeline.recording.command_scale import roll
+from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.readings import Held, Reading
+from pipeline.recording.timeouts import CommandTimeout, find_timeout
 from pipeline.simulate import Incident, Program, Scenario
-from pipeline.stages.drive_numbers import find_timeout
 
 STARTS = np.linspace(12.0, 280.0, 20)
 LONG_S = 1.5
@@ -74,9 +76,27 @@ def test_commands_that_were_not_recorded_are_no_silence(drive: TakeThrough) -> N
     """The recorder lost them, and the base heard them."""
     taken = drive(replace(fall_silent(0.5), incidents=()))
     assert "command_timeout" not in taken.ids(), "nothing fell silent"
-    tables = dict(taken.extracted.tables)
-    times = tables["commands"]["t"].to_numpy()
-    lost = ((times[:, None] > STARTS) & (times[:, None] < STARTS + LONG_S)).any(axis=1)
-    tables["commands"] = tables["commands"].filter(~pl.Series(lost))
-    vehicle = taken.aligned.vehicle
-    assert find_timeout(*roll(tables["wheels"], vehicle), tables["commands"], vehicle) is None
+    assert find_among(taken, "commands") is None
+
+
+def test_silences_of_the_whole_log_tell_nothing(drive: TakeThrough) -> None:
+    """The recorder stood: nothing shows whether the base did."""
+    taken = drive(fall_silent(0.5))
+    assert find_among(taken) is not None
+    assert find_among(taken, "commands", "wheels") is None
+
+
+def find_among(taken: Taken, *lost: str) -> CommandTimeout | None:
+    """The time-out where some tables have no row in the silences."""
+    readings = []
+    for name in ("commands", "wheels"):
+        table = taken.extracted.tables[name]
+        since = table["t"].to_numpy()[:, None] - STARTS
+        silent = ((since > 0.0) & (since < LONG_S)).any(axis=1)
+        times, velocity = roll(
+            table.filter(pl.Series(~silent)) if name in lost else table, taken.aligned.vehicle
+        )
+        readings.append(Reading("body", "", *(Held(times, velocity[:, axis]) for axis in (0, 2))))
+    motion = roll_wheels(readings[1])
+    assert motion is not None
+    return find_timeout(readings[0], motion, 0.5)
