@@ -144,8 +144,7 @@ class Run(StoredRun):
     """
 
     def __init__(self, manifest: Manifest, store: Store) -> None:
-        super().__init__(manifest)
-        self._store = store
+        super().__init__(manifest, store)
         self.name = manifest.run
         self.summary: Content = manifest.read_json(SUMMARY)
         self.verdict = str(self.summary.get("verdict") or "")

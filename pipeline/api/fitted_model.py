@@ -21,6 +21,7 @@ from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
+from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.estimation.transfer import carry_over, fit_as_it_is
 from pipeline.export import export_model, read_current
@@ -39,10 +40,10 @@ from pipeline.models import Model as MotionModel
 from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, read_result
+from pipeline.results import RunDiagnosis, read_result, read_suggestion
 from pipeline.run import HORIZON_S, MotionError, MotionRun
 from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
-from pipeline.store import Manifest
+from pipeline.store import Manifest, Store
 from pipeline.words import format_ladder, format_parameters
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")
@@ -137,10 +138,12 @@ class StoredRun:
 
     Args:
         manifest: its results.
+        store: the folder of results.
     """
 
-    def __init__(self, manifest: Manifest) -> None:
+    def __init__(self, manifest: Manifest, store: Store) -> None:
         self.manifest = manifest
+        self._store = store
 
     def table(self, name: str) -> pl.LazyFrame:
         """One of its tables."""
@@ -150,6 +153,11 @@ class StoredRun:
     def slip(self) -> pl.LazyFrame:
         """Slip per time step: the table ``slip`` without the rows that medians leave out."""
         return self.table("slip").filter(~pl.col("suspect"))
+
+    def find_suggestion(self, vehicle: Vehicle) -> tuple[Effect, ...]:
+        """The formula that its stored diagnosis suggests; empty without one."""
+        diagnosis = find_diagnosis(self._store.root, self.manifest)
+        return () if diagnosis is None else read_suggestion(diagnosis, vehicle)
 
 
 class Model:
@@ -298,8 +306,9 @@ class Model:
     ) -> pl.DataFrame:
         """What it lacks to describe a run: the effects that help, the most helpful first.
 
-        The model is fitted to the run, then with each effect whose signature is in its residual, and judged
-        on data that the fit has not seen, as the workbench does it; what does not help is left out.
+        The model is fitted to the run, then with each effect whose signature is in its residual, and with the
+        formula that the run's diagnosis suggests, and judged on data that the fit has not seen, as the
+        workbench does it; what does not help is left out.
 
         Args:
             run: an analyzed run.
@@ -307,10 +316,11 @@ class Model:
             vehicle_of: whose geometry counts where the run is of another vehicle.
 
         Returns:
-            A row an effect: ``effect``, its id; ``sentence``, what the vehicle does by it; ``t_mrmse_m`` [m]
-            and ``r_mrmse_rad`` [rad], the errors over 2 s with it; ``t_removed`` and ``r_removed``, the
-            shares of the errors without it that it removes, below zero where one grows; ``same_as``, ids of
-            effects that this run does not tell from it. No row where nothing helps.
+            A row an effect: ``effect``, its id, that of the formula is ``suggested_term``; ``sentence``, what
+            the vehicle does by it; ``t_mrmse_m`` [m] and ``r_mrmse_rad`` [rad], the errors over 2 s with it;
+            ``t_removed`` and ``r_removed``, the shares of the errors without it that it removes, below zero
+            where one grows; ``same_as``, ids of effects that this run does not tell from it. No row where
+            nothing helps.
 
         Raises:
             SlipError: the run has no such input, is too short, or is of another vehicle.
@@ -318,7 +328,7 @@ class Model:
         problem, state = self._prepare(run, input, vehicle_of)
         model = replace(self.file.model, vehicle=problem.vehicle, effects=state.effects_of(0))
         with threadpool_limits(1):
-            tries = Tries(problem, model)
+            tries = Tries(problem, model, run.find_suggestion(problem.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
         rows = [
             {

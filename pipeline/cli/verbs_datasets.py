@@ -104,6 +104,7 @@ def _compare_causes(
     from pipeline.datasets import (  # noqa: PLC0415 - heavy
         find_causes,
         format_difference,
+        format_tests,
         name_causes,
         summarize_causes,
     )
@@ -123,7 +124,8 @@ def _compare_causes(
         ]
     lines += [""] * bool(causes.differences)
     for one in causes.differences if everything else causes.differences[:_FEW]:
-        lines += [format_difference(one, names), *([f"  {one.note}"] if one.note else [])]
+        tests = format_tests(one, names)
+        lines += [format_difference(one, names), *([f"  {tests}"] if tests else [])]
     if not everything and len(causes.differences) > _FEW:
         lines.append(f"{len(causes.differences) - _FEW} more differences (--all, page)")
     page = _find_page(written, "causes.html")

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         Difference,
         find_causes,
         format_difference,
+        format_tests,
         name_causes,
         summarize_causes,
         tabulate_budgets,

@@ -30,7 +30,7 @@ from pipeline.datasets.compared_runs import (
 from pipeline.datasets.pairs import ABOUT_BLOCKS, BLOCKS, NO_SPREAD, RUNS
 from pipeline.datasets.pooled_tests import compare_means, pool_spread
 from pipeline.datasets.prediction import fit_results
-from pipeline.datasets.rank_tests import adjust_holm
+from pipeline.datasets.rank_tests import LEVEL, adjust_holm
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.models import list_effects, name_effect
 from pipeline.results import CAUSE_NAMES
@@ -38,6 +38,7 @@ from pipeline.store import NoRunsError, Store, lack_runs
 
 _LEAST_SHOWN = 0.05
 """Minimum share of a difference for a cause to be reported; twice that share could omit a tenth of it."""
+_JACKKNIFE = "jackknife over the blocks of each run"
 _NO_PART = 0.01
 """Share of a difference below which a cause is reported as no contribution: it would round to 0 or 1 %."""
 
@@ -74,7 +75,11 @@ class Budget:
 
 @dataclass(frozen=True)
 class CauseDifference:
-    """Contribution of a cause to the difference of two deployments [m/s]; p is NaN if not tested."""
+    """Contribution of a cause to the difference of two deployments [m/s].
+
+    ``p`` is NaN if it is not tested; ``method`` is the test, or what the interval is made of, and empty
+    without either.
+    """
 
     name: str
     kind: str
@@ -83,6 +88,7 @@ class CauseDifference:
     high: float
     p: float
     p_adjusted: float
+    method: str
 
 
 @dataclass(frozen=True)
@@ -128,6 +134,25 @@ class Difference:
         )
         rest = f"; no contribution: {', '.join(names[part.name] for part in none)}" if none else ""
         return f"{self.b} has {self.total:.2g} m/s more RMS slip than {self.a}: {words}{rest}"
+
+    def describe_tests(self, names: Mapping[str, str]) -> str:
+        """How the causes were tested and which are significant, or why none was tested.
+
+        Args:
+            names: display name of each cause.
+        """
+        judged = [part for part in self.parts if math.isfinite(part.p)]
+        if not judged:
+            methods = dict.fromkeys(part.method for part in self.parts if part.method)
+            return "; ".join([self.note, *(f"intervals by {method}" for method in methods)])
+        causes: dict[str, list[str]] = {}
+        for part in judged:
+            causes.setdefault(part.method, []).append(names[part.name])
+        usual = max(causes, key=lambda method: len(causes[method]))
+        said = [f"tested by {usual}"]
+        said += [f"{', '.join(own)} by {method}" for method, own in causes.items() if method != usual]
+        sure = [names[part.name] for part in judged if part.p_adjusted <= LEVEL]
+        return "; ".join([*said, f"significant after Holm: {', '.join(sure) or 'none'}"])
 
 
 def compare_causes(
@@ -252,27 +277,29 @@ def _compare(a: _Group, b: _Group) -> Difference:
     total, scale = math.sqrt(b.mean_square) - math.sqrt(a.mean_square), _scale(a, b)
     single = a.table.shape[0] == b.table.shape[0] == 1
     squares = _subtract(a, b)
-    tests: list[tuple[float, float, float]] = []
+    tests: list[tuple[float, float, float, str]] = []
     for cause, difference in squares.items():
         (first, half_first), (second, half_second) = a.take(cause), b.take(cause)
         low = high = p = math.nan
+        method = ""
         if single:
             half = float(np.hypot(half_first[0], half_second[0]))
-            low, high = difference - half, difference + half
+            low, high, method = difference - half, difference + half, _JACKKNIFE
         elif pool_spread([first, second])[1]:
             test = compare_means([first, second], [(0, 1)], tests=len(squares))
             # Zeros of a cause that no run has do not scatter: they tell no spread of the other side.
             if not test.is_pooled or (first.any() and second.any()):
                 (outcome,) = test.differences
-                p, ends = outcome.p, outcome.interval
+                p, ends, method = outcome.p, outcome.interval, test.method
                 low, high = (low, high) if ends is None else (ends.low, ends.high)
-        tests.append((low, high, p))
-    known = np.isfinite([p for *_, p in tests])
+        tests.append((low, high, p, method))
+    values = np.array([p for *_, p, _ in tests])
+    known = np.isfinite(values)
     adjusted = np.full(known.size, np.nan)
-    adjusted[known] = adjust_holm(np.array([p for *_, p in tests])[known])
+    adjusted[known] = adjust_holm(values[known])
     parts = [
-        CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q)
-        for ((name, kind), difference), (low, high, p), q in zip(
+        CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q, method)
+        for ((name, kind), difference), (low, high, p, method), q in zip(
             squares.items(), tests, adjusted.tolist(), strict=True
         )
     ]
@@ -388,12 +415,14 @@ def summarize_causes(causes: Causes) -> dict[str, object]:
                         "name": causes.names.get(part.name, part.name),
                         "difference": part.difference,
                         **pick_finite(part, "low", "high", "p", "p_adjusted"),
+                        "method": part.method or None,
                     }
                     for part in one.parts
                 ],
                 "unit_of_analysis": one.unit,
                 "note": one.note or None,
                 "sentence": format_difference(one, causes.names),
+                "tests": format_tests(one, causes.names) or None,
             }
             for one in causes.differences
         ],
@@ -419,7 +448,16 @@ def _summarize_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, obj
 
 def format_difference(one: Difference, names: Mapping[str, str]) -> str:
     """Text of a difference, with effects named by their levels."""
-    return one.describe({part.name: names.get(part.name, part.name) for part in one.parts})
+    return one.describe(_name_parts(one, names))
+
+
+def format_tests(one: Difference, names: Mapping[str, str]) -> str:
+    """How a difference was tested, with effects named by their levels; empty without more to say."""
+    return one.describe_tests(_name_parts(one, names))
+
+
+def _name_parts(one: Difference, names: Mapping[str, str]) -> dict[str, str]:
+    return {part.name: names.get(part.name, part.name) for part in one.parts}
 
 
 def tabulate_budgets(causes: Causes) -> pl.DataFrame:
@@ -439,10 +477,12 @@ def tabulate_differences(causes: Causes) -> pl.DataFrame:
     """Differences of every pair of datasets by cause."""
     rows = [
         (one.a, one.b, causes.names.get(part.name, part.name), part.difference, finite_or_none(part.low),
-         finite_or_none(part.high), finite_or_none(part.p), finite_or_none(part.p_adjusted), one.unit)
+         finite_or_none(part.high), finite_or_none(part.p), finite_or_none(part.p_adjusted), one.unit,
+         part.method or None)
         for one in causes.differences
         for part in one.parts
     ]  # fmt: skip
     numbers = dict.fromkeys(("difference", "low", "high", "p", "p_adjusted"), pl.Float64)
     texts = dict.fromkeys(("a", "b", "cause"), pl.String)
-    return pl.DataFrame(rows, schema={**texts, **numbers, "unit_of_analysis": pl.String}, orient="row")
+    words = dict.fromkeys(("unit_of_analysis", "method"), pl.String)
+    return pl.DataFrame(rows, schema={**texts, **numbers, **words}, orient="row")

@@ -111,20 +111,22 @@ class Tries:
     Args:
         problem: the run.
         model: the current model.
+        suggested: formulas to try beside the catalogue.
     """
 
-    def __init__(self, problem: Problem, model: Model) -> None:
+    def __init__(self, problem: Problem, model: Model, suggested: Sequence[Effect] = ()) -> None:
         self._problem, self._model = problem, model
         self._base = judge_whole(problem, model)
         self._moves: dict[str, Floats] = {}
         self.before = self._base.errors
-        self.candidates = list_promising(problem, self._base.fitted)
+        promising = [candidate() for candidate in list_promising(problem, self._base.fitted)]
+        self.candidates = [*promising, *(one for one in suggested if one.id not in model)]
 
     def try_each(self) -> Iterator[Addition | None]:
         """Each candidate, fitted and judged; None for one that cannot be fitted to this run."""
         for candidate in self.candidates:
             try:
-                after = judge_whole(self._problem, self._model + candidate())
+                after = judge_whole(self._problem, self._model + candidate)
             except (MotionError, ArithmeticError, ValueError):
                 yield None
                 continue

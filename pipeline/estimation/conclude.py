@@ -148,7 +148,7 @@ def summarize(
         ),
         unobservable_why=unobservable,
         detectable=tuple(one for path in paths for one in path.detectable if one.id not in hidden),
-        unexplained=_find_unexplained(paths, ground, learned, region),
+        unexplained=_find_unexplained(paths, ground, judgement or ground, learned, region),
         findings=(
             *note_cut(body.search.budget),
             *(() if judgement is None else find_change(judgement)),
@@ -176,12 +176,16 @@ def summarize(
 
 
 def _find_unexplained(
-    paths: Sequence[Explored], ground: Judgement | None, learned: LearnedStep | None, region: Region | None
+    paths: Sequence[Explored],
+    ground: Judgement | None,
+    leading: Judgement | None,
+    learned: LearnedStep | None,
+    region: Region | None,
 ) -> Unexplained | None:
     """What no effect explains: a formula, else a learned term, what lasts, or where nearly all of it is."""
     formula = paths[0].formula
-    if ground is not None and formula is not None:
-        suggested = residual_structure.suggest(ground, formula)
+    if ground is not None and leading is not None and formula is not None:
+        suggested = residual_structure.suggest(ground, formula, leading)
         if suggested is not None:
             return suggested
     if learned is not None:

@@ -95,8 +95,14 @@ def _list_terms(fit: PartFit) -> list[FormulaEffect]:
     return [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
 
 
-def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:
-    """A formula as a suggestion, with the errors of the model with it; None where it does not lower them."""
+def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) -> Unexplained | None:
+    """A formula as a suggestion, with the errors of the model with it; None where it does not lower them.
+
+    Args:
+        judgement: of the model without it, from what it was found on.
+        formula: with its values.
+        leading: of that model from the input that the diagnosis speaks of, whose errors are those said.
+    """
     with suppress(MotionError):
         step = judge_whole(judgement.problem, judgement.fitted.model + formula)
         if not lowers_errors(judgement.whole.errors, step.errors):
@@ -109,6 +115,9 @@ def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:
         channel = CHANNELS[int(np.argmax(falls))][-1]
         fitted = step.fitted.model.effect(formula.id)
         channels = tuple(name[-1] for name, fall in zip(CHANNELS, falls.tolist(), strict=True) if fall > 0.0)
+        said = step
+        if leading is not judgement:
+            said = judge_whole(leading.problem, leading.fitted.model + formula)
         return Unexplained(
             "formula",
             float(falls.max()),
@@ -116,7 +125,7 @@ def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:
             channels or (channel,),
             judgement.problem.source.value,
             formula=format_effect(fitted),
-            with_formula=read_result(errors_as_json(step.errors), Errors),
+            with_formula=read_result(errors_as_json(said.errors), Errors),
         )
     return None
 

@@ -34,6 +34,7 @@ from pipeline.datasets import (
     TerrainMap,
     fit_results,
     format_difference,
+    format_tests,
     list_features,
     name_causes,
     summarize_fleet,
@@ -437,7 +438,8 @@ def render_causes(causes: Causes) -> str:
 
 
 def _format_one(one: Difference, names: Mapping[str, str]) -> str:
-    return format_difference(one, names) + (f" ({one.note})" if one.note else "")
+    tests = format_tests(one, names)
+    return format_difference(one, names) + (f". {tests[:1].upper()}{tests[1:]}" if tests else "")
 
 
 def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
@@ -522,11 +524,12 @@ def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Ta
 def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str, str]) -> Table:
     columns = (
         Column("difference"), Column("cause"), Column("more slip", "m/s", number=True),
-        Column("95 % interval", number=True), Column("p corrected", number=True), Column("unit"),
+        Column("95 % interval", number=True), Column("p corrected", number=True), Column("method"),
     )  # fmt: skip
     rows = [
         (f"{one.b} \u2212 {one.a}", names.get(part.name, part.name), format_number(part.difference),
-         _format_cause_ends(part.low, part.high, format_number), format_number(part.p_adjusted), one.unit)
+         _format_cause_ends(part.low, part.high, format_number), format_number(part.p_adjusted),
+         part.method or MISSING)
         for one in differences
         for part in one.parts
     ]  # fmt: skip

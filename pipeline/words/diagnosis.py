@@ -150,7 +150,12 @@ def list_lines(
         return [*lines, *findings]
     if everything:
         return [*lines, *_list_all(run, findings)]
-    return [*lines, *_label("effects", _list_main(run)), *_label("remaining", _list_rest(run)), *findings]
+    return [
+        *lines,
+        *_label("effects", _list_main(run)),
+        *_label("remaining", _list_rest(run, verdict)),
+        *findings,
+    ]
 
 
 def _list_main(run: RunDiagnosis) -> list[str]:
@@ -190,7 +195,7 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
 
 
 def format_short(effect: Named) -> str:
-    """The first value of an effect with what it is, and how many more it has.
+    """The values of an effect with what they are; of more than two the first, and how many more it has.
 
     The name of an effect of one number with a unit says what it is: `yaw rate limit: limit = 1.01 rad/s`.
     """
@@ -200,12 +205,15 @@ def format_short(effect: Named) -> str:
         return _format_by_ground(effect)
     if not effect.shown:
         return ""
-    name, value = next(iter(effect.shown.items()))
-    about = describe_number(effect.id, name)
-    text = format_numbers({name: value})
-    if about and (len(effect.parameters) > 1 or value.unit == "1"):
-        text += f", {about}"
-    return f"{text}; {len(effect.shown) - 1} more" if len(effect.shown) > 1 else text
+    known = list(effect.shown.items())
+    is_said = len(effect.parameters) > 1 or known[0][1].unit == "1"
+    # Of two, neither stands for the other: a lag of speed is not one of turning.
+    shown = [
+        ", ".join(filter(None, (format_numbers({name: value}), describe_number(effect.id, name) * is_said)))
+        for name, value in (known if len(known) <= _MOST_IN_LINE else known[:1])
+    ]
+    hidden = len(known) - len(shown)
+    return "; ".join([*shown, *([f"{hidden} more"] if hidden else [])])
 
 
 def _format_by_ground(effect: Named) -> str:
@@ -233,13 +241,13 @@ def _format_largest_fall(before: Step, after: Step) -> str:
     )
 
 
-def _list_rest(run: RunDiagnosis) -> list[str]:
+def _list_rest(run: RunDiagnosis, verdict: str) -> list[str]:
     """What the effects do not explain, and a suggested term."""
     rest = run.unexplained
     if rest is None or (rest.kind == "lasting" and measure_excess(run) < ABOVE_FLOOR):
         # Noise that lasts, at the noise floor, stands behind --all.
         return []
-    return [describe_unexplained(rest), *list_terms(rest), format_suggestion(rest)]
+    return [describe_unexplained(rest), *list_terms(rest), format_suggestion(rest, verdict)]
 
 
 def list_terms(rest: Unexplained) -> list[str]:
@@ -393,13 +401,13 @@ def _list_formula(text: str) -> Iterator[str]:
             yield ", ".join([text, *known])
 
 
-def format_suggestion(rest: Unexplained) -> str:
-    """What a suggested formula would bring; empty without one."""
+def format_suggestion(rest: Unexplained, verdict: str = "") -> str:
+    """How to add a suggested formula, and what it would leave where the verdict does not say so."""
     if rest.with_formula is None:
         return ""
     remaining = format_step(rest.with_formula)
-    ways = "`slip serve`; in Python `model + diagnosis.suggestion`"
-    return f"no model holds it until you add it ({ways}): {remaining} would remain over {HORIZON_S:g} s"
+    text = "add it in `slip serve`, or in Python with `model + diagnosis.suggestion`"
+    return text if remaining in verdict else f"{text}: {remaining} would remain over {HORIZON_S:g} s"
 
 
 def _suggest_next_steps(run: RunDiagnosis) -> list[str]:

@@ -16,6 +16,7 @@ from pipeline.results import Unexplained
 from pipeline.simulate import simulate_case
 
 EFFECT = "effective_track"
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,22 @@ def test_a_suggested_formula_is_an_effect_to_add(run: slip.Run, diagnosis: slip.
     assert found.suggestion is not None
     fit = (slip.Model(run.vehicle.id) + found.suggestion).fit(run)
     assert "found.k" in repr(fit)
+
+
+def test_what_a_suggested_formula_leaves_is_one_number_on_every_face(tmp_path: Path) -> None:
+    log = ROOT / "data_samples" / "mystery_3.mcap"
+    run = slip.analyze(log, results=tmp_path / "results", report=False)
+    diagnosis = run.diagnose()
+    told = diagnosis.to_json()["unexplained"]
+    (model, suggestion) = (diagnosis.model, diagnosis.suggestion)
+    assert model is not None
+    assert suggestion is not None
+    errors = (model + suggestion).fit(run).errors
+    assert isinstance(told, dict)
+    assert told["with_formula"] == errors
+    best = model.missing(run).row(0, named=True)
+    assert best["effect"] == suggestion.id
+    assert (best["t_mrmse_m"], best["r_mrmse_rad"]) == (errors["t_mrmse_m"], errors["r_mrmse_rad"])
 
 
 def test_what_the_analysis_found_is_not_looked_for_again(

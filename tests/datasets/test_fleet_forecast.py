@@ -1,5 +1,6 @@
 """What the runs of a vehicle let expect of its numbers on a terrain."""
 
+import numpy as np
 import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
@@ -98,7 +99,27 @@ def test_what_the_fit_to_all_runs_found_is_expected_within_what_runs_differ_by()
     (k,) = start.numbers
     (fitted,) = expect_values(start, {k.label: k.ends[1] + 0.01}).numbers
     assert fitted.value == pytest.approx(k.ends[1] + 0.01)
-    assert fitted.ends == (k.ends[0], fitted.value)
+    low, high = fitted.ends
+    assert low < fitted.value < high
+    assert low < k.value < high
+    assert high - fitted.value > 0.3 * (high - k.value)
     (bounded,) = expect_values(start, {k.label: 1e9}).numbers
     assert bounded.value == k.bounds[1]
     assert expect_values(start, {"drive_lag.tau": 1.0}) == start
+
+
+def test_numbers_that_vary_together_from_run_to_run_are_drawn_together() -> None:
+    track = draw({"ice": 1.8}, effect="effective_track", parameter="k", runs=20)
+    radius = draw({"ice": 0.9}, effect="wheel_radius", parameter="k", runs=20, seed=1)
+    trading = radius.with_columns(value=0.9 - (track["value"] - track["value"].mean()))
+    correlations = {}
+    for name, second, runs in (("many", trading, 20), ("few", trading, 2), ("apart", radius, 20)):
+        both = pl.concat([one.filter(pl.int_range(pl.len()) < runs) for one in (track, second)])
+        numbers = forecast_vehicle(both, "warthog", "ice", "measured").numbers
+        own = [forecast_vehicle(rows, "warthog", "ice", "measured").numbers[0] for rows in (track, second)]
+        if runs == 20:
+            assert sorted(one.value for one in numbers) == sorted(one.value for one in own)
+        correlations[name] = float(np.corrcoef([number.draws for number in numbers])[0, 1])
+    assert correlations["many"] < -0.75
+    assert abs(correlations["few"]) < 0.5
+    assert abs(correlations["apart"]) < 0.5

@@ -48,6 +48,9 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
     assert "(--all)" not in everything
 
 
+LAGS = {"mean": "speed", "diff": "turning"}
+
+
 @pytest.mark.parametrize(
     ("name", "units", "text"),
     [
@@ -56,7 +59,7 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
         (
             "turn_lag",
             {"tau_mean": "s", "tau_diff": "s"},
-            "tau_mean = 2.00 s [1.90, 2.10], time constant of the mean; 1 more",
+            "; ".join(f"tau_{key} = 2.00 s [1.90, 2.10], time constant of {of}" for key, of in LAGS.items()),
         ),
         ("my_term", {"k_1": "s/m"}, "k_1 = 2.00 s/m [1.90, 2.10]"),
     ],

@@ -19,13 +19,13 @@ TurnLag = declare(
     __doc__,
     ("tau_mean * dM/dt = u - M\ntau_diff * dD/dt = u - D"),
     replace(
-        time_constant("tau_mean", "time constant of the mean", 0.3, (0.1, 0.4)),
+        time_constant("tau_mean", "time constant of speed", 0.3, (0.1, 0.4)),
         plausible=_SEEN,
         quantities=(Quantity.SPEED_LAG,),
         between_runs=Spread(0.12),
     ),
     replace(
-        time_constant("tau_diff", "time constant of the difference", 1.0, (0.3, 1.2)),
+        time_constant("tau_diff", "time constant of turning", 1.0, (0.3, 1.2)),
         plausible=_SEEN,
         quantities=(Quantity.TURN_LAG,),
         between_runs=Spread(0.24),
