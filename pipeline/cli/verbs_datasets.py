@@ -17,7 +17,8 @@ from pipeline.core import (
     SlipError,
     align_rows,
     format_count,
-    format_part,
+    format_share,
+    format_two,
     split_interval,
 )
 
@@ -92,6 +93,10 @@ def compare(  # noqa: D417 - arguments document themselves
     )
 
 
+_LEAST_SHARE = 0.01
+"""Share of a budget from which on its cause is named on a screen; the page has all."""
+
+
 def _compare_causes(
     store: Store,
     question: Question,
@@ -115,13 +120,12 @@ def _compare_causes(
     content, names = summarize_causes(causes), name_causes(causes.names)
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
-        parts = ", ".join(f"{names.get(one.name, one.name)} {format_part(one.share)}" for one in budget.parts)
-        runs = format_count(budget.runs, "run")
-        lines += [
-            "",
-            f"{budget.dataset}: root mean square {budget.total**0.5:.3g} m/s, {runs}",
-            f"  {parts}",
-        ]
+        shown = [one for one in budget.parts if everything or abs(one.share) >= _LEAST_SHARE]
+        parts = [f"{names.get(one.name, one.name)} {format_share(one.share, 0)}" for one in shown]
+        others = 1.0 - sum(one.share for one in shown)
+        parts += [f"others {format_share(others, 0)}"] if abs(others) >= _LEAST_SHARE else []
+        rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
+        lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
     lines += [""] * bool(causes.differences)
     for one in causes.differences if everything else causes.differences[:_FEW]:
         tests = format_tests(one, names)

@@ -177,6 +177,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    everything: All = False,
     json: bool = False,
 ) -> int:
     """Show topics, rates, gaps, clocks and damage of a log.
@@ -184,12 +185,13 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     Shows which topics are used, and why; or why the log cannot be analyzed.
 
     Args:
+        everything: show all topics, notes and metadata, and how the motion follows each signal.
         json: print one JSON object.
     """
     from pipeline.recording.inspection import inspect_log  # noqa: PLC0415 - heavy
 
     seen = inspect_log(log, build_options(choices))
-    print_result(_log_as_json(seen), lambda: _format_log(seen), json=json)
+    print_result(_log_as_json(seen), lambda: _format_log(seen, everything=everything), json=json)
     return LOSSY if seen.losses or seen.problem else CLEAN
 
 
@@ -228,45 +230,80 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
     }
 
 
-def _format_log(seen: Inspection) -> list[str]:
-    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
+_MOST_NOTES = 3
+"""Losses, and notes, that are shown by default: the others are counted."""
+_MOST_TOPICS = 10
+"""Topics up to which all are shown by default: of more, those that are used."""
 
+
+def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     index = seen.index
+    size = f"{format_size(index.size_bytes)}, {format_duration(seen.duration_s)}"
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
-    lines = [
-        f"log       {index.path}",
-        f"          {format_size(index.size_bytes)}, {format_duration(seen.duration_s)}, {packing}",
-        f"          {_format_count(seen)}",
-        f"          profile {index.profile or '-'}, written by {index.library or '-'}",
-        f"health    {'complete' if not seen.losses else 'with losses'}"
-        + (f", unchecked: {seen.unchecked}" if seen.unchecked else ""),
-    ]
-    lines += [f"  lost    {loss.text}" for loss in seen.losses]
-    lines += [f"  note    {note}" for note in seen.notes]
-    for name, record in index.metadata.items():
-        values = [f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items()]
-        lines.append(f"metadata  {name}: " + ", ".join(values))
-    lines += ["", *_format_topics(seen.topics), ""]
+    lines = [f"log       {index.path}{'' if everything else f'    {size}'}"]
+    if everything:
+        lines += [
+            f"          {size}, {packing}",
+            f"          {_format_count(seen)}",
+            f"          profile {index.profile or '-'}, written by {index.library or '-'}",
+        ]
+    unchecked = f", unchecked: {seen.unchecked}" if seen.unchecked else ""
+    lines.append(f"health    {'complete' if not seen.losses else 'with losses'}{unchecked}")
+    lines += _cut([f"  lost    {loss.text}" for loss in seen.losses], everything=everything)
+    lines += _cut([f"  note    {note}" for note in seen.notes], everything=everything)
+    lines += _format_metadata(seen) if everything else []
+    # Of a log that cannot be analyzed any topic may tell why.
+    lines += ["", *_format_topics(seen, everything=everything or seen.problem is not None), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.choice is not None and seen.vehicle is not None:
         gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
         lines[-1] += f"{gear}    {format_vehicle_source(seen.choice.vehicle_source)}"
+    lines += _format_roles(seen)
+    notes = []
     if seen.sources is not None:
-        for role in _ROLES:
-            source = getattr(seen.sources, role)
-            if source or role != "power":
-                none = "none: the whole log counts" if role == "interval" else "none"
-                lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else none}")
-        notes = [note for note in seen.sources.notes if not note.startswith("pose")]
-        lines += [f"{'' if index else 'choice':<10}{note}" for index, note in enumerate(notes)]
+        notes += [f"choice    {note}" for note in seen.sources.notes if not note.startswith("pose")]
     if seen.choice is not None:
-        lines += _format_ratings(seen.choice.ratings)
-        lines += _format_evidence(seen.choice.recording)
-        lines += [f"note      {finding.text}" for finding in seen.choice.findings]
+        if everything:
+            lines += _format_ratings(seen.choice.ratings)
+            lines += _format_evidence(seen.choice.recording)
+        elif others := len(seen.choice.ratings) - 1:
+            lines += [f"          {format_count(others, 'other pose')} (--all)"] if others > 0 else []
+        findings = sorted(seen.choice.findings, key=lambda one: one.severity == "info")
+        notes += [f"note      {finding.text}" for finding in findings]
+    lines += _cut(notes, everything=everything)
     if seen.problem:
         why = f"{seen.problem.what}. {seen.problem.hint.rstrip('.')}."
         lines.append(f"problem   the log cannot be analyzed: {why}")
     return lines
+
+
+def _cut(lines: Sequence[str], *, everything: bool) -> list[str]:
+    """The first lines of a list, and how many more it has."""
+    if everything or len(lines) <= _MOST_NOTES:
+        return list(lines)
+    return [*lines[:_MOST_NOTES], f"          {len(lines) - _MOST_NOTES} more (--all)"]
+
+
+def _format_metadata(seen: Inspection) -> list[str]:
+    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
+
+    return [
+        f"metadata  {name}: "
+        + ", ".join(f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items())
+        for name, record in seen.index.metadata.items()
+    ]
+
+
+def _format_roles(seen: Inspection) -> list[str]:
+    """What each role is read from, and why."""
+    if seen.sources is None:
+        return []
+    used = {role: getattr(seen.sources, role) for role in _ROLES}
+    return [
+        f"{role:<10}{f'{source}    {source.reason}' if source else 'none'}"
+        for role, source in used.items()
+        if source or role not in {"interval", "power"}
+    ]
 
 
 def _format_count(seen: Inspection) -> str:
@@ -307,11 +344,17 @@ def _format_evidence(recording: Recording | None) -> list[str]:
     return ["", *align_rows(rows), about]
 
 
-def _format_topics(topics: Sequence[TopicHealth]) -> list[str]:
-    width = max([len(topic.topic) for topic in topics] + [5])
+def _format_topics(seen: Inspection, *, everything: bool) -> list[str]:
+    """Table of the topics, of many by default those that are used."""
+    used = set() if seen.sources is None else seen.sources.topics
+    everything |= len(seen.topics) <= _MOST_TOPICS
+    shown = [one for one in seen.topics if everything or one.topic in used]
+    others = len(seen.topics) - len(shown)
+    width = max([len(topic.topic) for topic in shown] + [5])
     numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'latency':>11}"
     head = f"{'topic':<{width}}  {numbers}  type"
-    return [head, *(_format_topic(topic, width) for topic in topics)]
+    rows = [head, *(_format_topic(topic, width) for topic in shown)]
+    return [*rows, f"{format_count(others, 'other topic')} (--all)"] if others else rows
 
 
 def _format_topic(topic: TopicHealth, width: int) -> str:

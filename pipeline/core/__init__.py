@@ -111,6 +111,7 @@ if TYPE_CHECKING:
         format_recorded,
         format_share,
         format_size,
+        format_two,
         guess_names,
         make_plain,
         mark_finding,

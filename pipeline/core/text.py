@@ -151,6 +151,12 @@ def format_digits(value: float, digits: int = 2) -> str:
     return text.rstrip("0").rstrip(".") if places else text
 
 
+def format_two(value: float) -> str:
+    """A number of two significant digits, zeros included: 2.0 and 0.50."""
+    leading = math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{max(1 - leading, 0)}f}"
+
+
 _LEAST_UNITS = 3.55
 """Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
 moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is

@@ -16,7 +16,16 @@ from itertools import combinations
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, Floats, finite_or_none, format_share, pick, pick_finite
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    Floats,
+    finite_or_none,
+    format_share,
+    format_two,
+    name_first,
+    pick,
+    pick_finite,
+)
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
     Question,
@@ -126,14 +135,15 @@ class Difference:
                 for part in self.parts
                 if abs(part.difference) >= _LEAST_SHOWN * largest
             )
-            return f"{self.b} has {self.total:.2g} m/s more RMS slip than {self.a}; by cause in m/s: {words}"
+            slip = f"{format_two(self.total)} m/s more RMS slip"
+            return f"{self.b} has {slip} than {self.a}; by cause in m/s: {words}"
         main_parts = [part for part in self.parts if abs(part.difference) >= _LEAST_SHOWN * self.total]
-        none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
+        none = [names[part.name] for part in self.parts if abs(part.difference) < _NO_PART * self.total]
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
         )
-        rest = f"; no contribution: {', '.join(names[part.name] for part in none)}" if none else ""
-        return f"{self.b} has {self.total:.2g} m/s more RMS slip than {self.a}: {words}{rest}"
+        rest = f"; no contribution: {', '.join(name_first(none))}" if none else ""
+        return f"{self.b} has {format_two(self.total)} m/s more RMS slip than {self.a}: {words}{rest}"
 
     def describe_tests(self, names: Mapping[str, str]) -> str:
         """How the causes were tested and which are significant, or why none was tested.
@@ -158,7 +168,7 @@ class Difference:
 def compare_causes(
     rows: pl.DataFrame, *, untested: Collection[frozenset[str]] = ()
 ) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:
-    """Return the budgets of deployments and the decomposition of the difference of two.
+    """Return the budgets of deployments and the decomposition of the difference of two, tested ones first.
 
     A cause that is absent from a run contributes zero there; its slip is part of that run's disturbance.
 
@@ -169,7 +179,8 @@ def compare_causes(
     """
     groups = _gather(rows)
     pairs = [(a, b) for a, b in _pair(groups) if frozenset((a.name, b.name)) not in untested]
-    return tuple(group.describe() for group in groups), tuple(_compare(a, b) for a, b in pairs)
+    differences = sorted((_compare(a, b) for a, b in pairs), key=lambda one: bool(one.note))
+    return tuple(group.describe() for group in groups), tuple(differences)
 
 
 @dataclass(frozen=True)

@@ -339,8 +339,8 @@ class Check:
         return not change.smallest <= max(*distances, parameter.usual_size)
 
     def name_outcome(self, name: str) -> str:
-        """Status of a quantity; `not shown` in place of unchanged where a change could have been missed."""
-        return "not shown" if self.is_unseen(name) else self.changes[name].status
+        """Status of a quantity; `unclear` in place of unchanged where a change could have been missed."""
+        return "unclear" if self.is_unseen(name) else self.changes[name].status
 
     @property
     def code(self) -> int:

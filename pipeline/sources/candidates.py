@@ -178,6 +178,16 @@ class Sources:
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
     power: PowerSource | None = None
 
+    @property
+    def topics(self) -> set[str]:
+        """Names of the topics that are used."""
+        drives = [self.command, self.wheels, None if self.pose is None else self.pose.wheels]
+        signals = [signal for one in drives if one is not None for signal in one.signals]
+        signals += [] if self.power is None else [*self.power.currents, *self.power.voltages]
+        named = [one.topic for one in (self.pose, self.imu, self.interval) if one is not None]
+        velocity = [] if self.pose is None else [self.pose.velocity]
+        return {*(signal.topic for signal in signals), *named, *velocity} - {""}
+
     def rank_drives(self, role: Literal["command", "wheels"]) -> list[DriveSource]:
         """The choice for a role and its alternatives, the best first."""
         chosen = self.command if role == "command" else self.wheels

@@ -337,7 +337,7 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
 def _name_outcome(check: Check, name: str) -> str:
     """The outcome of a quantity; of two recordings nobody can say that nothing changed."""
     is_unchanged = check.changes[name].status == "unchanged"
-    return "not shown" if is_unchanged and _is_one_run(check) else check.name_outcome(name)
+    return "unclear" if is_unchanged and _is_one_run(check) else check.name_outcome(name)
 
 
 def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
@@ -359,7 +359,7 @@ def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
             else _name(check, name)
             for name in alike
         ]
-        few = "; too few runs to tell" if outcome == "not shown" and not _is_one_run(check) else ""
+        few = "; too few runs to tell" if outcome == "unclear" and not _is_one_run(check) else ""
         lines.append((outcome, enumerate_texts(list(dict.fromkeys(texts))) + few))
     return [*lines, ("", "all numbers, and the changes that could be detected: --all")] if lines else []
 

@@ -6,7 +6,14 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, enumerate_texts, format_count, format_share, number_in
+from pipeline.core import (
+    INPUT_WORDS,
+    enumerate_texts,
+    format_count,
+    format_share,
+    format_two,
+    number_in,
+)
 from pipeline.datasets import (
     ALIKE,
     AS_PUBLISHED,
@@ -136,8 +143,8 @@ def format_ratio(ratio: Ratios | None) -> str:
     if ratio is None:
         return ""
     value, low, high = ratio
-    ends = "" if low is None or high is None else f" [{_format_two(low)}, {_format_two(high)}]"
-    return f"{_format_two(value)}{ends}"
+    ends = "" if low is None or high is None else f" [{format_two(low)}, {format_two(high)}]"
+    return f"{format_two(value)}{ends}"
 
 
 @dataclass(frozen=True)
@@ -199,7 +206,7 @@ def list_pairs(answer: Answer, input_name: str) -> list[PairLine]:
                 is_driven_sure=judge_pair(row) == DIFFERENT,
                 equal=format_ratio(ratios[1]) or "no number" * bool(other),
                 is_equal_sure=bool(other) and judge_pair(other) == DIFFERENT,
-                driving=_format_two(parts[0] / parts[1]) if len(parts) > 1 else "",
+                driving=format_two(parts[0] / parts[1]) if len(parts) > 1 else "",
                 common="" if share is None or bins is None else _format_overlap(share, int(bins)),
                 carrier=answer.carriers.get((input_name, frozenset((row["a"], row["b"]))), ""),
                 p_driven=number_in(row, "p_adjusted"),
@@ -218,12 +225,6 @@ def list_pairs(answer: Answer, input_name: str) -> list[PairLine]:
 
 def _format_overlap(share: float, bins: int) -> str:
     return f"{format_share(share)}, {format_count(bins, 'cell')}" if bins else "none"
-
-
-def _format_two(value: float) -> str:
-    """A number of two significant digits, zeros included: 2.0 and 0.50."""
-    leading = math.floor(math.log10(abs(value))) if value else 0
-    return f"{value:.{max(1 - leading, 0)}f}"
 
 
 def _take(view: View | None, datasets: Sequence[str]) -> _Part | None:
@@ -246,17 +247,15 @@ def _find_extremes(part: _Part) -> tuple[str, str] | None:
 def _describe_driven(part: _Part, labels: Mapping[str, str]) -> str:
     (first, largest), *others = part.levels
     if not others:
-        return f"{labels[first]} {_format_two(largest)} m/s"
+        return f"{labels[first]} {format_two(largest)} m/s"
     easy, smallest = part.levels[-1]
     if not part.has_difference:
-        ends = (
-            f"from {labels[easy]} ({_format_two(smallest)}) to {labels[first]} ({_format_two(largest)} m/s)"
-        )
+        ends = f"from {labels[easy]} ({format_two(smallest)}) to {labels[first]} ({format_two(largest)} m/s)"
         return f"{ends}; {part.count()}"
     hard = [first, *(name for name, value in others[:-1] if value >= (1.0 - _AS_HARD) * largest)]
     values = dict(part.levels)
-    numbers = [f"{labels[name]} ({_format_two(values[name])}{' m/s' * (name == first)})" for name in hard]
-    easiest = f"{labels[easy]} ({_format_two(smallest)}) easiest"
+    numbers = [f"{labels[name]} ({format_two(values[name])}{' m/s' * (name == first)})" for name in hard]
+    easiest = f"{labels[easy]} ({format_two(smallest)}) easiest"
     return f"{enumerate_texts(numbers)} hardest, {easiest}; {part.count()}"
 
 
@@ -288,14 +287,14 @@ def _split_difference(
     (whole_factor, *_), (ground_factor, *_) = whole[0], ground[0]
     driving = whole_factor / ground_factor
     common = f"{format_share(number_in(ground[1], 'overlap') or 0.0)} of the driving in common"
-    start = f"{b} is {_format_two(whole_factor)} times {a} as driven"
+    start = f"{b} is {format_two(whole_factor)} times {a} as driven"
     if driving <= _LITTLE:
         return f"{start}, and the driving does not explain it ({common})"
     if ground_factor <= _LITTLE:
         return f"{start}, and all of it is the driving ({common})"
     sure = ", not significant" if judge_pair(ground[1]) == ALIKE else ""
     return (
-        f"{start}: a factor {_format_two(driving)} is the driving, {_format_two(ground_factor)} the "
+        f"{start}: a factor {format_two(driving)} is the driving, {format_two(ground_factor)} the "
         f"ground{sure} ({common})"
     )
 

@@ -115,11 +115,11 @@ def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> N
     unseen = replace(check, changes={**check.changes, name: blind})
     lines = list_lines(unseen)
     (row,) = (index for index, (_, text) in enumerate(lines) if text.startswith(LAG))
-    assert lines[row][0] == "not shown"
+    assert lines[row][0] == "unclear"
     assert lines[row + 3][1].strip() == "too few runs to detect a change of its own size"
     (case,) = (one for one in read_suite(unseen).iter("testcase") if one.get("name") == name)
     assert case.find("skipped") is not None
-    assert "| not shown |" in format_markdown(unseen)
+    assert "| unclear |" in format_markdown(unseen)
 
 
 def test_a_screen_has_a_row_for_what_changed_and_names_for_the_rest(late: Sides) -> None:
@@ -128,7 +128,7 @@ def test_a_screen_has_a_row_for_what_changed_and_names_for_the_rest(late: Sides)
     (changed,) = (text for label, text in lines if label == "changed")
     assert changed.startswith(f"{LAG}  0.")
     assert changed.count("[") == 1
-    named = " ".join(text for label, text in lines if label in {"unchanged", "not shown"})
+    named = " ".join(text for label, text in lines if label in {"unchanged", "unclear"})
     assert "effective track" in named
     assert not any("detectable change 0" in text for _, text in lines)
     assert len(lines) < len(list_lines(found))
@@ -136,15 +136,13 @@ def test_a_screen_has_a_row_for_what_changed_and_names_for_the_rest(late: Sides)
 
 def test_an_error_that_could_double_unseen_is_not_called_unchanged(same: Sides) -> None:
     check = compare(same)
-    for smallest, outcome in ((0.5, "unchanged"), (3.4, "not shown")):
+    for smallest, outcome in ((0.5, "unchanged"), (3.4, "unclear")):
         one = replace(check.changes[POSITION_ERROR], status="unchanged", smallest=smallest)
         changed = replace(check, changes={**check.changes, POSITION_ERROR: one})
         lines = list_lines(changed)
         (row,) = (index for index, (_, text) in enumerate(lines) if text.startswith("position error over"))
         assert lines[row][0] == outcome
-        assert lines[row + 3][1].endswith("too few runs to detect a factor of two") == (
-            outcome == "not shown"
-        )
+        assert lines[row + 3][1].endswith("too few runs to detect a factor of two") == (outcome == "unclear")
 
 
 def test_one_run_a_side_says_how_the_two_differ_and_that_runs_may_differ_as_much(late: Sides) -> None:
@@ -161,9 +159,7 @@ def test_one_run_a_side_says_how_the_two_differ_and_that_runs_may_differ_as_much
     # The differences are the answer: each with its interval, of these recordings alone.
     lines = list_lines(found, everything=False)
     known = [name for name, change in found.changes.items() if change.status != "unknown"]
-    assert sum(label in {"differs", "not shown"} and text.endswith("]") for label, text in lines) == len(
-        known
-    )
+    assert sum(label in {"differs", "unclear"} and text.endswith("]") for label, text in lines) == len(known)
     change = found.changes["drive_lag.tau"]
     assert 0.0 < change.within[0] < 0.15 < change.within[1]
     assert change.low < change.within[0]
