@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.core import JSON_DIGITS, Floats, finite_or_none, pick
 from pipeline.estimation.errors import Errors, errors_as_json, measure_errors
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import HeldOut, hold_out
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
@@ -241,7 +242,7 @@ class Judgement:
     @cached_property
     def floor(self) -> Errors:
         """The noise floor of the runs: of the ideal and of the whole model, what the better one leaves."""
-        floors = (self.problem.floor, self.problem.find_floor(self.physics.fitted.fits[0].residual))
+        floors = (self.problem.floor, estimate_floor(self.problem, self.physics.fitted.state))
         return min(floors, key=lambda one: one.t_mrmse_m * one.r_mrmse_rad)
 
 

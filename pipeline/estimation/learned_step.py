@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import FOLDS, Flags, Floats, Ints, format_share, robust_spreads
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.errors import Errors
+from pipeline.estimation.evidence import regress
 from pipeline.estimation.held_out import HeldOut, find_in_test, hold_out, number_predictions, score
 from pipeline.estimation.ladder import Judgement, LadderStep, find_share_removed, judge_whole
 from pipeline.estimation.model_fit import Fitted, fit_model
@@ -61,10 +62,6 @@ _LEAST_GAIN = 0.01
 """Minimum relative decrease of a channel's held-out sum of squares; below it, no term is added there."""
 _WORSE = 0.02
 """Tolerated relative increase of an error on a left-out ground with a learned term."""
-_ROUNDS = 200
-"""Maximum number of fixed-point iterations of the evidence; about twenty are usual."""
-_CONVERGED = 1e-4
-"""Relative change of both precisions below which the evidence has converged."""
 
 
 @dataclass(frozen=True)
@@ -171,39 +168,11 @@ def regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats
     for number in range(FOLDS):
         test = fold == number
         if test.any():
-            remaining += float(
-                ((target[test] - inputs[test] @ regress(inputs[~test], target[~test])) ** 2).sum()
-            )
+            coefficients = regress(inputs[~test], target[~test], _INDEPENDENT)
+            remaining += float(((target[test] - inputs[test] @ coefficients) ** 2).sum())
     if remaining > (1.0 - _LEAST_GAIN) * float((target**2).sum()):
         return np.zeros(inputs.shape[1])
-    return regress(inputs, target)
-
-
-def regress(inputs: Floats, target: Floats) -> Floats:
-    """Coefficients of Bayesian linear regression, both precisions maximize the evidence, shape (p,)."""
-    normal, pull = (
-        _INDEPENDENT * product for product in (np.asarray(inputs.T @ inputs), np.asarray(inputs.T @ target))
-    )
-    square, count = _INDEPENDENT * float(target @ target), _INDEPENDENT * target.size
-    sizes, turn = np.linalg.eigh(normal)
-    sizes, turned = np.maximum(sizes, 0.0), turn.T @ pull
-    weight, noise = 1.0, count / max(square, 1e-12)
-    mean = np.zeros(sizes.size)
-    if not sizes.any():
-        return mean
-    for _ in range(_ROUNDS):
-        mean = noise * turned / (noise * sizes + weight)
-        known = float((noise * sizes / (noise * sizes + weight)).sum())
-        remaining = max(square - float(2.0 * mean @ turned - (mean**2) @ sizes), 1e-12)
-        precisions = min(known / max(float(mean @ mean), 1e-12), 1e12), max(count - known, 1.0) / remaining
-        is_done = all(
-            abs(new - old) <= _CONVERGED * old for new, old in zip(precisions, (weight, noise), strict=True)
-        )
-        weight, noise = precisions
-        if is_done:
-            break
-    coefficients: Floats = turn @ mean
-    return coefficients
+    return regress(inputs, target, _INDEPENDENT)
 
 
 def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:

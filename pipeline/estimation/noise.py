@@ -141,14 +141,6 @@ class Noise:
     def _filter(self, values: Floats, steps: Steps, channel: int) -> tuple[Floats, Floats]:
         return _filter(values, steps, self.step_s, self.correlation[channel], self.share[channel])
 
-    def spread_after(self, seconds: Floats) -> tuple[Floats, Floats]:
-        """Variances of the sum of increments over times by poses and by disturbance, shape (m, 3) each."""
-        count = np.maximum(seconds / self.step_s, 1.0)[:, None]
-        phi, variance = self.correlation, self.spread**2
-        poses = np.broadcast_to(2.0 * (1.0 - self.share) * variance, (count.size, 3))
-        grown = count * (1.0 + phi) / (1.0 - phi) - 2.0 * phi * (1.0 - phi**count) / (1.0 - phi) ** 2
-        return poses, self.share * variance * grown
-
 
 def learn_noise(
     residual: Floats,

@@ -158,12 +158,8 @@ class Problem:
 
     @cached_property
     def floor(self) -> Errors:
-        """The noise floor of these runs, independent of any fit (see `estimate_floor`)."""
-        return self.find_floor(self.parts[0].find_residuals(self.start_state()))
-
-    def find_floor(self, residual: Floats) -> Errors:
-        """The noise floor from increments that a model leaves, shape (n, 3)."""
-        return estimate_floor(self.parts[0], residual, self.whole.run.size)
+        """The noise floor of these runs by what the ideal model leaves, see `estimate_floor`."""
+        return estimate_floor(self, self.start_state())
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:

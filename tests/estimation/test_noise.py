@@ -136,15 +136,6 @@ def test_no_disturbance_lasts_longer_than_noise_does() -> None:
     assert times.max() <= 2.0 * (1.0 + 1e-6)
 
 
-def test_sums_of_increments_spread_as_stated() -> None:
-    noise, steps = make_noise(), make_steps(40_000)
-    sums = np.cumsum(draw_increments(noise, steps, 9), axis=0)
-    for count in (1, 5, 20):
-        poses, motion = noise.spread_after(np.array([count * STEP_S]))
-        drawn = (sums[count:] - sums[:-count]).var(axis=0)
-        assert (poses + motion)[0] == pytest.approx(drawn, rel=0.12)
-
-
 def test_noise_of_one_kind_alone_is_found_at_its_bound_and_left_again() -> None:
     steps = make_steps(4000)
     lasting = Noise(STEP_S, np.full(3, 0.4), np.ones(3), SCALE[None])
