@@ -241,9 +241,8 @@ class Judgement:
 
     @cached_property
     def floor(self) -> Errors:
-        """The noise floor of the runs: of the ideal and of the whole model, what the better one leaves."""
-        floors = (self.problem.floor, estimate_floor(self.problem, self.physics.fitted.state))
-        return min(floors, key=lambda one: one.t_mrmse_m * one.r_mrmse_rad)
+        """The noise floor of the runs, by what the physics leaves."""
+        return estimate_floor(self.problem, self.physics.fitted.state)
 
 
 def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:
