@@ -43,8 +43,8 @@ def estimate_floor(problem: Problem, state: State) -> Errors:
     residual = part.find_residuals(state)
     rest = _explain_all(part, residual)
     errors = score(problem if len(problem.parts) == 1 else problem.behind_wheels, state).pooled
-    left = [_measure(part, one) for one in (residual, rest)]
-    x, y, w, t, r = np.minimum(left[1] / np.maximum(left[0], 1e-12), 1.0).tolist()
+    before, after = (_measure(part, one) for one in (residual, rest))
+    x, y, w, t, r = np.minimum(after / np.maximum(before, 1e-12), 1.0).tolist()
     names = {name: t if name.startswith("t_") else r for name in vars(errors) if name[:2] in ("t_", "r_")}
     return replace(
         errors,

@@ -215,8 +215,6 @@ def test_the_floor_is_nearly_the_same_whatever_the_model_lacks() -> None:
     assert np.allclose(floors[0].ratios(floors[1]), 1.0, atol=0.2)
     judged = judge_model(Problem([run], HUSKY, Input.MEASURED), model_of("effective_track", "icr_offset"))
     assert np.allclose(judged.floor.ratios(floors[1]), 1.0, atol=0.2)
-    # Of what two models leave the better one counts.
-    assert judged.floor.t_mrmse_m * judged.floor.r_mrmse_rad <= floors[1].t_mrmse_m * floors[1].r_mrmse_rad
     low = replace(judged.floor, t_mrmse_m=1.2 * judged.ladder.steps[-1].errors.t_mrmse_m)
     share = judged.ladder.explained_shares(low)[-1]
     assert share is not None
