@@ -199,9 +199,9 @@ class _Run:
         level = float(np.median(held)) if held.size >= _FEWEST else 0.0
         if not now or not level or np.ptp(held) > 2.0 * _ALIKE * level:
             return math.nan, math.nan
-        times, left = self.times[now - 1 : stop], self.speed[now - 1 : stop] / level - 0.5
-        left = -left if rises else left
-        over = np.flatnonzero(left < 0.0)
+        times, beyond = self.times[now - 1 : stop], self.speed[now - 1 : stop] / level - 0.5
+        beyond = -beyond if rises else beyond
+        over = np.flatnonzero(beyond < 0.0)
         reached = int(over[0]) if over.size else times.size
         seen = np.append(times, end)[: reached + 1]
         if not reached or (np.diff(seen) > _HOLE * self.step).any():
@@ -209,7 +209,7 @@ class _Run:
         if not over.size:
             return math.inf, level
         before, after = times[reached - 1], times[reached]
-        share = left[reached - 1] / (left[reached - 1] - left[reached])
+        share = beyond[reached - 1] / (beyond[reached - 1] - beyond[reached])
         return float(before + share * (after - before) - start), level
 
 
