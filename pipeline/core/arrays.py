@@ -190,7 +190,7 @@ def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
 
 def integrate_rate(times: Floats, rate: Floats) -> Floats:
     """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero."""
-    return np.asarray(scipy.integrate.cumulative_trapezoid(rate, times, initial=0.0))
+    return np.append(0.0, np.cumsum(np.diff(times) * (rate[1:] + rate[:-1]) / 2.0))
 
 
 _GAUSSIAN = 1.4826

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, group_rows, robust_spread
 
@@ -65,16 +64,22 @@ def rotation_vectors(quaternion: Floats) -> Floats:
 
 def quaternions_from_vectors(vector: Floats) -> Floats:
     """Exponential of rotation vectors (n, 3) [rad]: unit quaternions (n, 4)."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - heavy
+
     return np.asarray(Rotation.from_rotvec(np.array(vector)).as_quat())
 
 
 def quaternions_from_yaw(yaw: Floats) -> Floats:
     """Unit quaternions (n, 4) of rotations about z by ``yaw`` [rad], shape (n,)."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - heavy
+
     return np.asarray(Rotation.from_euler("z", yaw[..., None]).as_quat())
 
 
 def quaternions_from_euler(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
     """Unit quaternions (n, 4) of intrinsic z-y-x rotations (yaw, then pitch, then roll) [rad]."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - heavy
+
     return np.asarray(Rotation.from_euler("ZYX", np.stack((yaw, pitch, roll), axis=-1)).as_quat())
 
 

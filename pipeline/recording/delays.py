@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core import Floats
 from pipeline.recording.case import Candidate, Case
-from pipeline.recording.geometry import explain_wheels
 from pipeline.recording.motion import Motion
-from pipeline.recording.readings import DELAYS_S, Explained
+from pipeline.recording.readings import DELAYS_S, Explained, Reading
 from pipeline.recording.score import CLEAR, LEAST_NATS, compare
 from pipeline.stages import Finding
 
@@ -41,15 +38,11 @@ def settle_delay(
         return
     reading = command.reading
     if case.driven is not None and wheels is not None:
-        measured, followed, beside = (
-            wheels.reading,
-            "the wheels",
-            [one.topic for one in wheels.source.signals],
-        )
-        made = _compare(case.driven, lambda delays: explain_wheels(reading, measured, delays))
+        followed, beside = "the wheels", [one.topic for one in wheels.source.signals]
+        made = _compare(replace(reading, third=None, third_crossed=None), case.driven)
     elif motion is not None and reading.explained is not None and case.sources.pose is not None:
         followed, beside = "poses", [case.sources.pose.topic]
-        made = _compare(reading.explained, lambda delays: replace(reading).explain(motion, delays))
+        made = _compare(reading, reading.explained)
     else:
         return
     if made is None or (made.delay > 0.0 and case.driven is None):
@@ -80,19 +73,17 @@ def settle_delay(
     case.driven = None if case.driven is None else replace(made, delay=made.delay + late)
 
 
-def _compare(made: Explained, explain: Callable[[Floats], Explained | None]) -> Explained | None:
+def _compare(reading: Reading, made: Explained) -> Explained | None:
     """The fit with a delay; None where it is not clearly better than a lag alone.
 
     Args:
-        made: the fit with the usual delays.
-        explain: the same with others.
+        reading: the command.
+        made: its fit with the usual delays.
     """
     if made.delay <= DELAYS_S[0]:
-        made = explain(_EARLIER_S) or made
+        made = reading.fit_to(made.motion, _EARLIER_S, crossed=made.crossed)
     if abs(made.delay) <= _ERROR_S:
         return None
-    at_once = explain(np.zeros(1))
-    if at_once is None:
-        return made
+    at_once = reading.fit_to(made.motion, np.zeros(1), crossed=made.crossed)
     nats = float((made.blocks - at_once.blocks).sum()) / made.motion.moved.size
     return made if nats > LEAST_NATS and compare(made.blocks, at_once.blocks) > CLEAR else None

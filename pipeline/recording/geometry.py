@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import Floats, format_share, join_parts
+from pipeline.core import format_share, join_parts
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
 from pipeline.recording.motion import STEP_S, Motion
-from pipeline.recording.readings import DELAYS_S, SIDES, Explained, Reading
+from pipeline.recording.readings import SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
 from pipeline.sources import RANGES, DriveForm, find_alike
 
@@ -91,13 +91,12 @@ def roll_wheels(wheels: Reading) -> Motion | None:
     return Motion(steps, join_parts(ahead, 0.0), np.zeros(turned.size), turned, "z")
 
 
-def explain_wheels(command: Reading, wheels: Reading, delays: Floats = DELAYS_S) -> Explained | None:
+def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
     """What wheels do of a command: their motion takes the place of a pose's.
 
     Args:
         command: of the body, of both sides, or of speed and steering.
         wheels: what is measured of them.
-        delays: see `Reading.explain`.
 
     Returns:
         The fit; None if the wheels do not follow the command, or one of its sides counts backward.
@@ -106,7 +105,7 @@ def explain_wheels(command: Reading, wheels: Reading, delays: Floats = DELAYS_S)
     motion = roll_wheels(wheels) if is_whole else None
     if motion is None:
         return None
-    made = Reading(command.form, command.name, command.first, command.second).explain(motion, delays)
+    made = Reading(command.form, command.name, command.first, command.second).explain(motion)
     return None if made is None or not made.is_sure or made.crossed else made
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -232,7 +232,7 @@ class Explained:
 
 
 _AS_IT_IS = 0.5
-"""Least share of both channels that a command explains as it is: near zero where a side is reversed."""
+"""Least share of both channels that signals explain as they are: near zero where a side is reversed."""
 
 
 @dataclass
@@ -294,13 +294,8 @@ class Reading:
             return np.zeros((steps.start.size, 0))
         return aside.integrate(steps, lag, delay)[:, None]
 
-    def explain(self, whole: Motion, delays: Floats = DELAYS_S) -> Explained | None:
-        """Fit the motion; also kept as ``explained``.
-
-        Args:
-            whole: the motion.
-            delays: that are tried first, shape (k,), and near which the delay is [s].
-        """
+    def explain(self, whole: Motion) -> Explained | None:
+        """Fit the motion; also kept as ``explained``."""
         self.explained = None
         if not self.inputs:
             return None
@@ -314,22 +309,15 @@ class Reading:
         two = [one for one in (self.first, self.second) if one in self.inputs]
         may_cross = self.form in {"sides", "body"} and len(two) == len(SIDES)
         may_cross = may_cross and (self.third is None or self.third_crossed is not None)
-        patterns = (False, True) if may_cross else (False,)
-        tried = {crossed: self.fit_to(motion, delays, crossed=crossed) for crossed in patterns}
+        made = self.fit_to(motion, DELAYS_S, crossed=False)
         # Laps of one radius are explained either way, for speed and yaw rate are proportional: where the
-        # command explains the motion as it is, nothing is reversed.
-        if may_cross and self.form == "body" and min(tried[False].shares) > _AS_IT_IS:
-            del tried[True]
-        best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
-        if best and compare(tried[True].blocks, tried[False].blocks) < CLEAR:
-            best = False
-        self.explained = tried[best]
-        if len(tried) > 1:
-            self.explained.other = tried[not best].blocks
-        for one in (self.first, self.second, self.third, self.third_crossed):
-            if one is not None:
-                one.forget()
-        return self.explained
+        # signals explain the motion as they are, nothing is reversed.
+        if may_cross and min(made.shares) <= _AS_IT_IS:
+            crossed = self.fit_to(motion, DELAYS_S, crossed=True)
+            one, other = (made, crossed) if compare(crossed.blocks, made.blocks) < CLEAR else (crossed, made)
+            made = replace(one, other=other.blocks)
+        self.explained = made
+        return made
 
     def _find_busy(self, motion: Motion) -> Flags:
         """Steps near which something is asked, or moves: at rest, noise would make all driving an outlier."""
@@ -344,7 +332,13 @@ class Reading:
         return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
 
     def fit_to(self, motion: Motion, delays: Floats, *, crossed: bool) -> Explained:
-        """Fit all of a motion, with the sign of one side as given; see `explain`."""
+        """Fit all of a motion.
+
+        Args:
+            motion: where the reading is recorded.
+            delays: that are tried first, shape (k,), and near which the delay is [s].
+            crossed: whether one side counts backward.
+        """
         lag, delay = self._find_delay(motion, delays, crossed=crossed)
         ahead, yaw = motion.body.real, motion.yaw
         first, second = self.columns(motion.steps, lag, delay, crossed=crossed)
@@ -377,6 +371,9 @@ class Reading:
             measure_share(ahead, float(made.ahead.gains[0]) * first),
             measure_share(yaw, float(made.turned.gains[0]) * second),
         )
+        for one in (self.first, self.second, self.third, self.third_crossed):
+            if one is not None:
+                one.forget()
         return made
 
     def _find_delay(self, motion: Motion, delays: Floats, *, crossed: bool) -> tuple[float, float]:

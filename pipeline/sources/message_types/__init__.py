@@ -253,6 +253,12 @@ def _spell_fields(kind: MessageType) -> dict[str, str]:
     return spelled
 
 
+@functools.cache
+def _spell_known() -> dict[str, dict[str, str]]:
+    """The same of every type whose fields are not texts, by its name."""
+    return {name: _spell_fields(kind) for name, kind in read_tables()[0].items() if not kind.text}
+
+
 def find_alike(type_name: str, fields: Iterable[str]) -> dict[str, dict[str, str]]:
     """Other types with fields of the same meaning and unit.
 
@@ -267,11 +273,10 @@ def find_alike(type_name: str, fields: Iterable[str]) -> dict[str, dict[str, str
     meanings = {path: meaning for meaning, path in _spell_fields(own).items()}
     wanted = {path: meanings[path] for path in fields if path in meanings}
     alike: dict[str, dict[str, str]] = {}
-    for name, kind in read_tables()[0].items():
-        if not wanted or name == plain_type(type_name) or own.text or kind.text:
-            continue
-        theirs = _spell_fields(kind)
-        if all(meaning in theirs or _OPTIONAL.fullmatch(meaning) for meaning in wanted.values()):
+    for name, theirs in _spell_known().items() if wanted and not own.text else ():
+        if name != plain_type(type_name) and all(
+            meaning in theirs or _OPTIONAL.fullmatch(meaning) for meaning in wanted.values()
+        ):
             alike[name] = {path: theirs[meaning] for path, meaning in wanted.items() if meaning in theirs}
     return alike
 
