@@ -38,7 +38,7 @@ from pipeline.models import find_effect
 from pipeline.recording.log_setup import set_up_log
 from pipeline.results import Named, Value
 from pipeline.sources import DriveSection, DriveSource, Sources, Vehicle
-from pipeline.stages import Extraction, extract_tables, list_wanted
+from pipeline.stages import Extraction, Given, extract_tables, list_wanted
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
@@ -120,7 +120,7 @@ def _extract(log: Path) -> tuple[Sources, Vehicle, Mapping[str, pl.DataFrame]]:
     setup = set_up_log(log, Options(out=Path()))
     data = setup.choice.data if setup.choice.extracted is None else None
     data = data or read_topics(setup.index, list_wanted(setup.sources, setup.index.types))
-    made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=str(log))
+    made = extract_tables(Given(data, setup.sources, setup.configuration, setup.vehicle, str(log)))
     return setup.sources, setup.vehicle, made.tables
 
 

@@ -18,6 +18,7 @@ from pipeline.sources import Vehicle, describe_types
 from pipeline.stages import (
     POSE_FINDINGS,
     Finding,
+    Given,
     align_tables,
     checks,
     extract_tables,
@@ -169,12 +170,14 @@ class Work:
         data = self.data if self.data is not None else read_wanted(setup, self.sha256)
         known = setup.choice.recording
         made = setup.choice.extracted or extract_tables(
-            data,
-            setup.sources,
-            setup.configuration,
-            setup.vehicle,
-            where=str(setup.path),
-            cut=None if known is None else known.cut,
+            Given(
+                data,
+                setup.sources,
+                setup.configuration,
+                setup.vehicle,
+                str(setup.path),
+                None if known is None else known.cut,
+            )
         )
         # Columns and tables are large: drop the references as early as possible.
         self.data, data = None, replace(data, topics=())

@@ -26,7 +26,7 @@ from pipeline.models import read_model
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import read_drive
-from pipeline.stages import Finding, align_tables, extract_tables, list_wanted, slip_stage, velocity
+from pipeline.stages import Finding, Given, align_tables, extract_tables, list_wanted, slip_stage, velocity
 from pipeline.store import JSON, Store, check_table
 
 _FOLDER = "live"
@@ -288,7 +288,7 @@ class Watch:
         setup = self._setup[1]
         where = str(self.path)
         data = read_topics(index, list_wanted(setup.sources, index.types), sha256="growing")
-        made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=where)
+        made = extract_tables(Given(data, setup.sources, setup.configuration, setup.vehicle, str(self.path)))
         del data
         aligned = align_tables(
             {

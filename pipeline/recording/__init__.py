@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING
 from pipeline.core import INPUTS, SlipError
 
 if TYPE_CHECKING:
-    from pipeline.recording.case import Given
     from pipeline.recording.drive_alone import examine_drive
     from pipeline.recording.examination import Recording, examine
 
 __all__ = [
     "FAULTS",
-    "Given",
     "LogOptions",
     "Recording",
     "RecordingError",

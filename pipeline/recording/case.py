@@ -10,22 +10,19 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Floats, SlipError
-from pipeline.logs import LogData
 from pipeline.recording.evidence import RATES, RIMS, SPEEDS, WHEELS, Axis, Units
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR
 from pipeline.sources import (
     CONFIGURED,
-    UNKNOWN_VEHICLE,
     Configuration,
     DriveForm,
     DriveSection,
     DriveSource,
-    Sources,
     Vehicle,
 )
-from pipeline.stages import Extraction, Finding, find_sideways_share
+from pipeline.stages import Extraction, Finding, Given
 
 TAKEN_M = 0.1
 """Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
@@ -43,37 +40,6 @@ _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
     },
 }
 """Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
-
-
-@dataclass(frozen=True)
-class Given:
-    """A log before it is examined.
-
-    Attributes:
-        data: columns of the chosen pose, the gyro and every candidate for a command and for wheels.
-        sources: the pose, and candidates by type and name, the likeliest first.
-        configuration: the user's; what it gives is not decided here.
-        vehicle: the log's, or `UNKNOWN_VEHICLE` of its kind.
-        where: the log, for error messages.
-    """
-
-    data: LogData
-    sources: Sources
-    configuration: Configuration
-    vehicle: Vehicle
-    where: str
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the vehicle's geometry is known."""
-        return self.vehicle.id != UNKNOWN_VEHICLE
-
-    def may_move_sideways(self, sources: Sources) -> bool:
-        """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
-        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
-        return self.vehicle.kinematics.has_inputs("sideways") or any(
-            find_sideways_share(self.data.topics, one) for one in drives
-        )
 
 
 @dataclass
@@ -143,13 +109,13 @@ class Case:
         equal = replace(self.sources, others={**self.sources.others, "command": ()}, power=None)
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
-        self.extraction = Extraction(given.data, equal, self.configuration, self.vehicle, given.where)
+        self.extraction = Extraction(replace(given, sources=equal))
         self.ahead = _find_ahead(self)
         if self.ahead is not None:
             equal = replace(equal, command=self.ahead[0])
             section = msgspec.structs.replace(self.configuration.command, time="log")
             by_log = msgspec.structs.replace(self.configuration, command=section)
-            self.extraction = Extraction(given.data, equal, by_log, self.vehicle, given.where)
+            self.extraction = Extraction(replace(given, sources=equal, configuration=by_log))
         self.moves_sideways = given.may_move_sideways(self.sources)
         self.driven: Explained | None = None
         # Whether what is commanded has a unit, so that the controller's lengths can be told from it.

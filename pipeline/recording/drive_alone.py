@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core import enumerate_texts
-from pipeline.recording.case import Candidate, Case, Given, is_crossed
+from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.delays import settle_delay
 from pipeline.recording.encoders import report_dead
@@ -31,7 +31,7 @@ from pipeline.sources import (
     PoseSource,
     Sources,
 )
-from pipeline.stages import Finding
+from pipeline.stages import Finding, Given
 
 _REASON = "no pose is recorded: the motion of the wheels stands in"
 

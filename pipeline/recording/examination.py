@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pipeline.core import SlipError
-from pipeline.recording.case import Case, Given
+from pipeline.recording.case import Case
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.delays import settle_delay
 from pipeline.recording.encoders import settle_wheels
@@ -29,7 +29,7 @@ from pipeline.recording.timeouts import settle_timeout
 from pipeline.recording.units import find_units, settle_gyro, settle_lengths
 from pipeline.run import Alignment
 from pipeline.sources import Configuration, Sources
-from pipeline.stages import Cut, Finding
+from pipeline.stages import Cut, Finding, Given
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from pipeline.core import return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -61,7 +62,7 @@ from pipeline.sources import (
     recognize_vehicle,
     resolve_vehicle,
 )
-from pipeline.stages import Extracted, Finding, find_sideways_share, list_wanted, with_texts
+from pipeline.stages import Extracted, Finding, Given, find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
@@ -290,7 +291,7 @@ def _lacks_pose(
 
 def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configuration) -> Choice:
     """The choice for a log without poses, see `examine_drive`; unchanged if its wheels cannot be read."""
-    from pipeline.recording import Given, examine_drive  # noqa: PLC0415 - heavy
+    from pipeline.recording import examine_drive  # noqa: PLC0415 - heavy
 
     drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, drives))
@@ -466,14 +467,16 @@ def _compare(
     chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
 ) -> Choice:
     """Choose among the poses by their content, then the other roles by the motion of the pose."""
-    from pipeline.recording import Given, examine  # noqa: PLC0415 - heavy
+    from pipeline.recording import examine  # noqa: PLC0415 - heavy
     from pipeline.stages import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
     drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, [*rivals, *drives]))
+    return_freed_memory()
     sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
+    given = Given(data, sources, configuration, chosen.vehicle, where=str(index.path))
     if rivals or _may_be_odometry(sources.pose):
-        ratings = rate_poses(data, sources, configuration, chosen.vehicle, where=str(index.path))
+        ratings = rate_poses(given)
         if ratings and ratings[0].same_as:
             text = (
                 f"the pose of {ratings[0].source} is wheel odometry, not a localization: it is that of "
@@ -496,10 +499,10 @@ def _compare(
                 text = f"not used: the poses of {ratings[0].source}: {ratings[0].refusal}"
                 still = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
                 return replace(alone, findings=(*alone.findings, still))
-    recording = examine(Given(data, sources, configuration, chosen.vehicle, where=str(index.path)))
+    recording = examine(replace(given, sources=sources))
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
-        made = examine(Given(data, instead, configuration, chosen.vehicle, where=str(index.path)))
+        made = examine(replace(given, sources=instead))
         if made.is_followed and (made.margin > recording.margin or not recording.is_followed):
             text = (
                 f"{other.source} is taken for the pose, and not {ratings[0].source}: the vehicle moves as it "

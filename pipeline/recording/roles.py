@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core import Floats, format_duration
-from pipeline.recording.case import Candidate, Case, Given
+from pipeline.recording.case import Candidate, Case
 from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
 from pipeline.recording.kinds import settle_turn
 from pipeline.recording.motion import Motion
@@ -18,7 +18,7 @@ from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
 from pipeline.recording.units import settle_steering
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import COMMANDED, CONFIGURED, DriveForm, DriveSource, Sources
-from pipeline.stages import Finding
+from pipeline.stages import Finding, Given
 
 _STILL = 0.1
 """Gain of the motion on the drive below which a body stands: on ice it is .13 to .26 of the wheels."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
     from pipeline.stages.clocks import describe_pauses, find_pauses
     from pipeline.stages.drive import choose_sides, list_steered
-    from pipeline.stages.extract import Extracted, Extraction, extract_tables
+    from pipeline.stages.extract import Extracted, Extraction, Given, extract_tables
     from pipeline.stages.findings import Finding, Severity, StageError, blame_damage, tabulate_findings
     from pipeline.stages.inputs import WINDOW_S
     from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose

@@ -13,6 +13,7 @@ from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, format_share
 from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.sources import (
     DEFAULT_INTERVAL,
+    UNKNOWN_VEHICLE,
     Configuration,
     DriveForm,
     DriveSection,
@@ -60,6 +61,39 @@ _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INT
 
 
 @dataclass(frozen=True)
+class Given:
+    """A log with what is known of it: what its examination and its extraction start from.
+
+    Attributes:
+        data: columns of the wanted topics (see `reading.list_wanted`).
+        sources: topic of each role; before an examination, candidates by type and name, the likeliest first.
+        configuration: units, signs, clocks, intervals.
+        vehicle: the log's, or `UNKNOWN_VEHICLE` of its kind.
+        where: the log, for error messages.
+        cut: its poses, where they were cut before.
+    """
+
+    data: LogData
+    sources: Sources
+    configuration: Configuration
+    vehicle: Vehicle
+    where: str
+    cut: Cut | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the vehicle's geometry is known."""
+        return self.vehicle.id != UNKNOWN_VEHICLE
+
+    def may_move_sideways(self, sources: Sources) -> bool:
+        """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
+        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
+        return self.vehicle.kinematics.has_inputs("sideways") or any(
+            reading.find_sideways_share(self.data.topics, one) for one in drives
+        )
+
+
+@dataclass(frozen=True)
 class Extracted:
     """Result of the extract stage.
 
@@ -80,29 +114,13 @@ class Extracted:
     frames: tuple[str, str] = ("", "")
 
 
-def extract_tables(
-    data: LogData,
-    sources: Sources,
-    configuration: Configuration,
-    vehicle: Vehicle,
-    *,
-    where: str,
-    cut: Cut | None = None,
-) -> Extracted:
+def extract_tables(given: Given) -> Extracted:
     """Make the tables of the stage.
-
-    Args:
-        data: columns of the wanted topics (see `reading.list_wanted`).
-        sources: topic of each role.
-        configuration: units, signs, clocks, intervals.
-        vehicle: geometry for body commands and speeds in m/s.
-        where: the log, for error messages.
-        cut: poses of the log that were cut before.
 
     Raises:
         StageError: a role's topic contains no usable data.
     """
-    return Extraction(data, sources, configuration, vehicle, where, cut).run()
+    return Extraction(given).run()
 
 
 def _make_alike(channels: Sequence[TopicColumns]) -> list[TopicColumns]:
@@ -125,23 +143,13 @@ class Extraction:
     `examine` reads every candidate of a log by it; a run reads the chosen sources.
     """
 
-    def __init__(
-        self,
-        data: LogData,
-        sources: Sources,
-        configuration: Configuration,
-        vehicle: Vehicle,
-        where: str,
-        cut: Cut | None = None,
-    ) -> None:
-        topics, self.findings = remove_absurd(data.topics)
-        self.data = replace(data, topics=topics)
-        self.sources = sources
-        self.configuration = configuration
-        self.vehicle = vehicle
-        self.where = where
+    def __init__(self, given: Given) -> None:
+        topics, self.findings = remove_absurd(given.data.topics)
+        self.data = data = replace(given.data, topics=topics)
+        self.sources = sources = given.sources
+        self.configuration = configuration = given.configuration
+        self.vehicle, self.where, self.cut = given.vehicle, given.where, given.cut
         self.frames = ("", "")
-        self.cut = cut
         self._orders: dict[str, Ints] = {}
         # What is recorded beside the command explains it: it takes no part in clocks and in the time base.
         beside = sources.body_beside
@@ -159,7 +167,7 @@ class Extraction:
         pose = sources.pose
         drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
         self.chain = (
-            pose_topics.chain_poses(topics, pose, where, drive=drive)
+            pose_topics.chain_poses(topics, pose, self.where, drive=drive)
             if pose and pose.from_transforms
             else None
         )

@@ -14,12 +14,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Flags, Floats, SlipError, arrays, format_share, rigid
-from pipeline.logs import LogData
 from pipeline.run import LIVE_SHARE, SPAN_S
 from pipeline.sources import (
     DEAD_RECKONED,
     FILTERED,
-    Configuration,
     PoseContent,
     PoseSource,
     Sources,
@@ -27,7 +25,7 @@ from pipeline.sources import (
     is_localization,
 )
 from pipeline.stages.drive import read_speed
-from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.extract import Extracted, Given, extract_tables
 from pipeline.stages.findings import Finding
 from pipeline.stages.pose_topics import SLOW_HZ
 from pipeline.stages.reading import FEWEST_MESSAGES
@@ -101,24 +99,18 @@ class PoseRating:
         return f"{self.source}: {frames}, {share}; {self.reason}"
 
 
-def rate_poses(
-    data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
-) -> tuple[PoseRating, ...]:
-    """Candidates for the pose, the best first.
+def rate_poses(given: Given) -> tuple[PoseRating, ...]:
+    """Candidates for the pose of a log, the best first.
 
-    Args:
-        data: columns of all candidates and of the wheels.
-        sources: the choice by type and name, with the other candidates.
-        configuration: units, signs, clocks.
-        vehicle: vehicle with its geometry, or any vehicle of its kind: gains do not matter.
-        where: the log.
+    Any vehicle of its kind will do: gains do not matter.
     """
+    sources = given.sources
     if sources.pose is None:
         return ()
     others = [source for source in sources.others.get("pose", ()) if isinstance(source, PoseSource)]
     ratings: list[PoseRating] = []
     for candidate in (sources.pose, *others):
-        ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
+        ratings.append(_rate(given, candidate))
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
     rated = [_find_copy(one, ratings) for one in ratings]
@@ -157,17 +149,10 @@ def _round_positions(rating: PoseRating) -> set[tuple[float, ...]]:
     return set() if rating.position is None else {*map(tuple, np.round(rating.position, 6).tolist())}
 
 
-def _rate(
-    data: LogData,
-    pose: PoseSource,
-    sources: Sources,
-    configuration: Configuration,
-    vehicle: Vehicle,
-    where: str,
-) -> PoseRating:
-    alone = replace(sources, pose=pose, interval=None)
+def _rate(given: Given, pose: PoseSource) -> PoseRating:
+    alone = replace(given.sources, pose=pose, interval=None)
     try:
-        made = extract_tables(data, alone, configuration, vehicle, where=where)
+        made = extract_tables(replace(given, sources=alone))
     except SlipError as error:
         return PoseRating(pose, refusal=error.what)
     poses = made.tables["poses"].filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
@@ -186,7 +171,7 @@ def _rate(
     coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
     wheels = made.tables["wheels"]
     extent, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
-    path = _path_of(wheels, vehicle)
+    path = _path_of(wheels, given.vehicle)
     drove = path is not None and float(np.hypot(*np.diff(path[1:])).sum()) > _DRIVES_M
     if extent < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"

@@ -23,7 +23,7 @@ from pipeline.simulate import (
 from pipeline.sources import Configuration, DriveSection, find_preset, find_type, load_configuration
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints, unwrap_counter
-from pipeline.stages.extract import extract_tables
+from pipeline.stages.extract import Given, extract_tables
 from pipeline.stages.reading import find_angle_unit, is_upside_down, list_wanted, read_pose_topic, turn_over
 
 SECOND = 10**9
@@ -224,7 +224,7 @@ def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
     chosen = choose(index, Configuration(), {})
     types = {channel.topic: channel.type_name for channel in index.channels}
     data = read_topics(index, list_wanted(chosen.sources, types))
-    made = extract_tables(data, chosen.sources, Configuration(), chosen.vehicle, where="run.mcap")
+    made = extract_tables(Given(data, chosen.sources, Configuration(), chosen.vehicle, "run.mcap"))
     (finding,) = [found for found in made.findings if found.id == "sideways_command"]
     assert finding.severity == "error"
     assert "Husky A200 (differential) cannot do" in finding.text
