@@ -143,20 +143,21 @@ class PartFit:
 
 def whiten(part: Part, noise: Noise, residual: Floats, columns: Floats) -> White:
     """Weighted innovations of a residual (n, 3) and of columns (n, 3, p)."""
-    joined = np.concatenate((residual[:, :, None], columns), axis=2)
-    white = noise.whiten(joined, part.steps)
-    weights = np.sqrt(CLIP / np.maximum(np.abs(white[:, :, 0]), CLIP))
-    known = np.array(noise.known, dtype=np.int64)
-    rows = np.repeat(np.arange(residual.shape[0]), known.size)
-    flat = flatten(np.ascontiguousarray((white * weights[:, :, None])[:, known, :]))
-    return White(flat[:, 0], flat[:, 1:], rows, weights)
+    made = noise.whiten(residual[:, :, None], part.steps)
+    weights: Floats = np.sqrt(CLIP / np.maximum(np.abs(made[:, :, 0]), CLIP))
+    flat = _line_up(made * weights[:, :, None], noise)[:, 0]
+    rows = np.repeat(np.arange(residual.shape[0]), len(noise.known))
+    return White(flat, _line_up(noise.whiten(columns, part.steps, weights), noise), rows, weights)
 
 
 def whiten_columns(fit: PartFit, columns: Floats) -> Floats:
     """Columns (n, 3, q) in the rows of a fit's innovations, shape (m, q)."""
-    white = fit.noise.whiten(columns, fit.part.steps) * fit.white.weights[:, :, None]
-    known = np.array(fit.noise.known, dtype=np.int64)
-    return flatten(np.ascontiguousarray(white[:, known, :]))
+    return _line_up(fit.noise.whiten(columns, fit.part.steps, fit.white.weights), fit.noise)
+
+
+def _line_up(white: Floats, noise: Noise) -> Floats:
+    """Innovations (n, 3, q) of the channels that say anything, shape (m, q)."""
+    return flatten(white if len(noise.known) == white.shape[1] else white[:, noise.known])
 
 
 def _sum_squares(values: Floats) -> float:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import compiled
+from pipeline.core import Newest, compiled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -46,8 +46,8 @@ _LEAST_KEPT = 1e-6
 _LOGS = 16
 """Variances whose product is taken before its logarithm."""
 _SCALE_ROUNDS = 30
-_SAME_SCALE = 1e-6
-"""Relative change of a scale at which it has converged."""
+_SAME_SCALE, _NEAR_SCALE = 1e-6, 2e-3
+"""Relative change of a scale at which it has converged, and its cost, which is wrong by the cube of that."""
 _MEAN_SIZE = 1.2533
 """Ratio of the standard deviation of a normal distribution to its mean absolute value."""
 _GAUSSIAN = 1.4826
@@ -83,6 +83,21 @@ class Steps:
         lengths, kind = np.unique(np.round(self.spans, 3), return_inverse=True)
         return lengths, kind.astype(np.int64)
 
+    def find_gains(self, step_s: float, correlation: Floats, share: Floats) -> Floats:
+        """What the filters of some channels do at each step, see `_find_gains`, shape (n, 4, channels)."""
+
+        def make() -> Floats:
+            gains = np.empty((self.spans.size, 4, share.size))
+            decays = np.log(np.maximum(correlation, 1e-300)) / step_s
+            _find_gains(self.fresh, self.spans, decays, share, np.empty((3, share.size)), gains)
+            return gains
+
+        return self._gains.recall((step_s, correlation.tobytes(), share.tobytes()), make)
+
+    @cached_property
+    def _gains(self) -> Newest[Floats]:
+        return Newest(_GAINS)
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -113,33 +128,25 @@ class Noise:
         spread: Floats = np.sqrt(np.mean(scale**2, axis=0))
         return spread
 
-    def whiten(self, columns: Floats, steps: Steps) -> Floats:
-        """Innovations of columns in standard deviations, before any weight of outliers.
+    def whiten(self, columns: Floats, steps: Steps, weights: Floats | float = 1.0) -> Floats:
+        """Innovations of columns in standard deviations.
 
         Args:
             columns: increments, shape (n, 3, q).
             steps: the steps.
+            weights: of each increment, such as that of outliers, shape (n, 3).
 
         Returns:
             Shape (n, 3, q); zeros in channels that say nothing.
         """
-        white = np.zeros(columns.shape)
-        for channel in self.known:
-            values = np.ascontiguousarray(columns[:, channel, :])
-            made, spreads = self._filter(values, steps, channel)
-            white[:, channel, :] = made / (spreads * self.scale[steps.run, channel])[:, None]
-        return white
+        gains = steps.find_gains(self.step_s, self.correlation, self.share)
+        return _filter(columns, steps, gains, weights / (gains[:, _DEVIATION] * self.scale[steps.run]))
 
     def log_variance(self, steps: Steps) -> float:
         """Sum of the logarithms of the innovations' variances: what a likelihood has beside its squares."""
-        total, nothing = 0.0, np.zeros((steps.run.size, 1))
-        for channel in self.known:
-            spreads = self._filter(nothing, steps, channel)[1] * self.scale[steps.run, channel]
-            total += 2.0 * float(np.log(spreads[np.isfinite(spreads)]).sum())
-        return total
-
-    def _filter(self, values: Floats, steps: Steps, channel: int) -> tuple[Floats, Floats]:
-        return _filter(values, steps, self.step_s, self.correlation[channel], self.share[channel])
+        gains = steps.find_gains(self.step_s, self.correlation, self.share)
+        spreads = gains[:, _DEVIATION] * self.scale[steps.run]
+        return 2.0 * float(np.log(spreads[np.isfinite(spreads)]).sum())
 
 
 def learn_noise(
@@ -170,11 +177,12 @@ def learn_noise(
         known = None if start is None else (start.correlation[channel], start.share[channel])
         scaled = np.clip(values / np.where(rough > _LEAST, rough, np.inf)[steps.run][:, None], -_JUMP, _JUMP)
         phi, part = _maximize(scaled, steps, step_s, known, exact=exact)
-        made, deviations = _filter(scaled, steps, step_s, phi, part)
         correlation[channel], share[channel] = phi, part
+        gains = steps.find_gains(step_s, np.array([phi]), np.array([part]))
+        made = _filter(scaled[:, :, None], steps, gains, 1.0 / gains[:, _DEVIATION])
         for run, mine in enumerate(rows):
             if rough[run] > _LEAST:
-                outcome = rough[run] * _measure_scale(made[mine, 0] / deviations[mine])
+                outcome = rough[run] * _measure_scale(made[mine, 0])
                 scale[run, channel] = max(outcome, _LEAST)
     return Noise(step_s, correlation, share, scale)
 
@@ -188,8 +196,11 @@ def _measure_rough(values: Floats) -> float:
 
 
 def _measure_scale(innovations: Floats) -> float:
-    """Scale of most likelihood of innovations with a density that falls as exp(-`huber_cost` / 2)."""
-    return _find_scale(np.abs(innovations))
+    """Scale of most likelihood of innovations (n, 1), by a density that falls as exp(-`huber_cost` / 2)."""
+    rows, size = np.zeros(_ROWS * _LANES), np.ascontiguousarray(np.abs(innovations))
+    rows[_INVERSE] = 1.0 / max(_MEAN_SIZE * float(size.mean()), 1e-12)
+    _find_scales(rows, size, np.empty(1), _SAME_SCALE)
+    return 1.0 / float(rows[_INVERSE])
 
 
 def huber_cost(innovations: Floats) -> Floats:
@@ -210,6 +221,7 @@ def _maximize(
     most = math.exp(-step_s / _LONGEST_S)
     flat, size = np.ascontiguousarray(values[:, 0]), np.empty((values.shape[0], _LANES))
     costs, rows = np.empty(_LANES), np.empty(_ROWS * _LANES)
+    near = _SAME_SCALE if exact else _NEAR_SCALE
 
     def read(at: Floats) -> tuple[Floats, Floats]:
         phi, part = np.ascontiguousarray(np.sin(at.T) ** 2)
@@ -218,12 +230,12 @@ def _maximize(
     def rate(at: Floats) -> Floats:
         phi, part = read(at)
         keeps = np.exp(np.outer(steps.lengths / step_s, np.log(phi)))
-        _rate(flat, steps.fresh, steps.kind, keeps, part, rows, size, costs)
+        _rate(flat, steps.fresh, steps.kind, keeps, part, rows, size, costs, near)
         return costs
 
     starts, radius = np.array([(1.22, 0.35), (0.79, 1.02)]), 0.3
     if known is not None and not exact:
-        starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.06
+        starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.03
     same = _SAME_EXACT if exact else _SAME
     best = min((_descend(rate, start, radius, same) for start in starts), key=lambda one: one[0])
     phi, part = read(best[1][None])
@@ -249,9 +261,11 @@ def _descend(
         away = np.where(curvature > 0.0, np.abs(along) / np.maximum(curvature, 1e-12), _FAR)
         step = axes @ -np.copysign(np.minimum(away, _FAR), along)
         terms = _list_terms(np.vstack((step, _AROUND))) @ (level, *slope, xx, xy, yy)
-        if max(least - float(terms[0]), float(np.abs(costs - terms[1:]).max())) < same:
+        missed = float(np.abs(costs - terms[1:]).max())
+        # What a quadratic misses on the circle moves its lowest place: by the square of that it is too high.
+        if math.hypot(*step) <= 1.0 and missed * min(1.0, missed / max(float(curvature[0]), 1e-300)) < same:
             # Not the best of eight points: which one that is depends on rounding.
-            return least, np.asarray(center + radius * step)
+            return float(terms[0]), np.asarray(center + radius * step)
         center = np.asarray(center + radius * step) if is_lower else where
         radius *= 1.0 if is_lower and math.hypot(*step) >= 1.0 else _CLOSER
     return least, where
@@ -272,33 +286,98 @@ _QUADRATIC: Floats = np.asarray(np.linalg.pinv(_list_terms(_AROUND)), dtype=np.f
 """Terms of the quadratic through the costs of these points, shape (6, 8)."""
 
 
-def _filter(values: Floats, steps: Steps, step_s: float, phi: float, share: float) -> tuple[Floats, Floats]:
-    """Innovations of columns (n, q), and their standard deviations for a variance of one, shape (n,)."""
-    made, deviations = np.empty(values.shape), np.empty(steps.run.size)
-    state = np.empty((2, values.shape[1]))
-    _walk(values, steps.fresh, steps.spans, step_s, phi, share, state, made, deviations)
-    return made, deviations
+def _filter(columns: Floats, steps: Steps, gains: Floats, weights: Floats) -> Floats:
+    """Weighted innovations of columns (n, channels, q), weights of shape (n, channels)."""
+    made = np.empty((columns.shape[2], *weights.shape))
+    values = np.ascontiguousarray(columns.transpose(2, 0, 1))
+    _innovate(values, steps.fresh, gains, weights, np.empty((2, weights.shape[1])), made)
+    return made.transpose(1, 2, 0)
 
 
-@compiled("float64(float64[::1])")
-def _find_scale(size: Floats) -> float:
-    """Scale s at which the mean of min(z^2, CLIP z) of the sizes z = size / s is one."""
-    mean = 0.0
-    for value in size:
-        mean += value
-    scale = max(_MEAN_SIZE * mean / size.size, 1e-12)
-    for _ in range(_SCALE_ROUNDS):
-        total, slope = 0.0, 0.0
-        for value in size:
-            z = value / scale
-            held = min(z, CLIP)
-            total += held * z
-            slope += held * (z if z > CLIP else 2.0 * z)
-        grown = (total - size.size) / max(slope, 1e-300)
-        scale *= math.exp(grown)
-        if abs(grown) < _SAME_SCALE:
-            break
-    return scale
+# What a filter does at a step, in this order: what remains of a disturbance, gains, standard deviation.
+_KEEPS, _GAIN_A, _GAIN_N, _DEVIATION = range(4)
+_GAINS = 4
+"""Sets of gains that are kept: those of the noise in use, and of each channel of one that is learned."""
+
+
+@compiled()
+def _find_gain(share: float, keep: float, of_a: float, of_both: float, of_n: float) -> tuple[float, ...]:
+    """Variance and gains of a step, and the variances after it; see the module for the equations."""
+    noise = 1.0 - share
+    variance = of_a + of_n - 2.0 * of_both + noise
+    inverse = 1.0 / variance
+    gain_a, gain_n = (of_a - of_both) * inverse, noise * inverse
+    after = of_a - gain_a * gain_a * variance
+    return (
+        variance,
+        inverse,
+        gain_a,
+        gain_n,
+        keep * keep * after + (1.0 - keep * keep) * share,
+        -keep * gain_a * gain_n * variance,
+        noise - gain_n * gain_n * variance,
+    )
+
+
+@compiled("void(boolean[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1])")
+def _find_gains(
+    fresh: Flags, spans: Floats, decays: Floats, shares: Floats, variances: Floats, gains: Floats
+) -> None:
+    """Gains of the filters of a disturbance and the error of the last pose.
+
+    Args:
+        fresh: steps that do not continue the one before, shape (n,).
+        spans: their lengths [s], shape (n,).
+        decays: logarithm of what remains of each disturbance after a second, shape (channels,).
+        shares: of each in the variance, shape (channels,).
+        variances: room, shape (3, channels).
+        gains: the result, shape (n, 4, channels).
+    """
+    for row in range(spans.size):
+        for k in range(shares.size):
+            if fresh[row]:
+                variances[0, k], variances[1, k], variances[2, k] = shares[k], 0.0, 1.0 - shares[k]
+            is_same = row > 0 and spans[row] == spans[row - 1]
+            keep = gains[row - 1, _KEEPS, k] if is_same else math.exp(decays[k] * spans[row])
+            variance, _, gain_a, gain_n, of_a, of_both, of_n = _find_gain(
+                shares[k], keep, variances[0, k], variances[1, k], variances[2, k]
+            )
+            variances[0, k], variances[1, k], variances[2, k] = of_a, of_both, of_n
+            gains[row, _KEEPS, k], gains[row, _DEVIATION, k] = keep, math.sqrt(variance)
+            gains[row, _GAIN_A, k], gains[row, _GAIN_N, k] = gain_a, gain_n
+
+
+@compiled()
+def _follow(
+    value: float, keep: float, gain_a: float, gain_n: float, a: float, n: float
+) -> tuple[float, float, float]:
+    """What is new in an increment, and the disturbance and the error of the pose after it."""
+    new = value - a + n
+    return new, keep * (a + gain_a * new), gain_n * new
+
+
+@compiled(
+    "void(float64[:, :, ::1], boolean[::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1], "
+    "float64[:, :, ::1])"
+)
+def _innovate(
+    columns: Floats, fresh: Flags, gains: Floats, weights: Floats, state: Floats, made: Floats
+) -> None:
+    """Innovations of columns (q, n, channels), each times its weight."""
+    for column in range(columns.shape[0]):
+        for row in range(columns.shape[1]):
+            if fresh[row]:
+                state[:] = 0.0
+            for k in range(columns.shape[2]):
+                new, state[0, k], state[1, k] = _follow(
+                    columns[column, row, k],
+                    gains[row, _KEEPS, k],
+                    gains[row, _GAIN_A, k],
+                    gains[row, _GAIN_N, k],
+                    state[0, k],
+                    state[1, k],
+                )
+                made[column, row, k] = new * weights[row, k]
 
 
 # Rows of what `_rate` knows of each lane.
@@ -325,21 +404,16 @@ def _take_logs(rows: Floats, lanes: int) -> None:
 
 @compiled()
 def _predict(rows: Floats, lanes: int, value: float) -> None:
-    """One step of the filter in all lanes; see the module for the equations."""
+    """One step of the filter in all lanes."""
     for k in range(lanes):
-        share, keep, of_a, of_both = rows[_SHARE + k], rows[_KEEP + k], rows[_OF_A + k], rows[_OF_BOTH + k]
-        noise = 1.0 - share
-        variance = of_a + rows[_OF_N + k] - 2.0 * of_both + noise
-        inverse = 1.0 / variance
-        gain_a, gain_n = (of_a - of_both) * inverse, noise * inverse
-        fresh_part = value - rows[_A + k] + rows[_N + k]
-        rows[_SIZE + k] = abs(fresh_part) * math.sqrt(inverse)
-        rows[_A + k] = keep * (rows[_A + k] + gain_a * fresh_part)
-        rows[_N + k] = gain_n * fresh_part
-        rows[_OF_BOTH + k] = -keep * gain_a * gain_n * variance
-        rows[_OF_N + k] = noise - gain_n * gain_n * variance
-        after = of_a - gain_a * gain_a * variance
-        rows[_OF_A + k] = keep * keep * after + (1.0 - keep * keep) * share
+        keep = rows[_KEEP + k]
+        variance, inverse, gain_a, gain_n, of_a, of_both, of_n = _find_gain(
+            rows[_SHARE + k], keep, rows[_OF_A + k], rows[_OF_BOTH + k], rows[_OF_N + k]
+        )
+        new, a, n = _follow(value, keep, gain_a, gain_n, rows[_A + k], rows[_N + k])
+        rows[_OF_A + k], rows[_OF_BOTH + k], rows[_OF_N + k] = of_a, of_both, of_n
+        rows[_A + k], rows[_N + k] = a, n
+        rows[_SIZE + k] = abs(new) * math.sqrt(inverse)
         rows[_PRODUCT + k] *= variance
 
 
@@ -354,28 +428,41 @@ def _add_costs(rows: Floats, lanes: int) -> None:
         rows[_COST + k] += held * (2.0 * z - held)
 
 
-@compiled()
-def _scale(rows: Floats, lanes: int, size: Floats, costs: Floats) -> float:
-    """Costs at the present scales; moves the scales, and returns the largest relative change."""
-    for k in range(lanes):
-        rows[_TOTAL + k], rows[_SLOPE + k], rows[_COST + k] = 0.0, 0.0, 0.0
-    count = size.shape[0]
-    for row in range(count):
+@compiled("void(float64[::1], float64[:, ::1], float64[::1], float64)")
+def _find_scales(rows: Floats, size: Floats, costs: Floats, same: float) -> None:
+    """Scales at which the mean of min(z^2, CLIP z) of sizes z is one, by Newton's steps, and their costs.
+
+    Args:
+        rows: what belongs to each lane; its inverse scale is the first one here, and the best one then.
+        size: of innovations, shape (n, lanes).
+        costs: the result, those of the innovations and of the scales, shape (lanes,).
+        same: relative change at which a scale has converged.
+    """
+    count, lanes = size.shape
+    for _ in range(_SCALE_ROUNDS):
         for k in range(lanes):
-            rows[_SIZE + k] = size[row, k]
-        _add_costs(rows, lanes)
-    away = 0.0
-    for k in range(lanes):
-        grown = (rows[_TOTAL + k] - count) / max(rows[_SLOPE + k], 1e-300)
-        costs[k] = rows[_COST + k] - 2.0 * count * math.log(rows[_INVERSE + k]) + rows[_LOGS_SUM + k]
-        rows[_INVERSE + k] *= math.exp(-grown)
-        away = max(away, abs(grown))
-    return away
+            rows[_TOTAL + k], rows[_SLOPE + k], rows[_COST + k] = 0.0, 0.0, 0.0
+        for row in range(count):
+            for k in range(lanes):
+                rows[_SIZE + k] = size[row, k]
+            _add_costs(rows, lanes)
+        away = 0.0
+        for k in range(lanes):
+            grown = (rows[_TOTAL + k] - count) / max(rows[_SLOPE + k], 1e-300)
+            # The fall by the step that follows, to second order.
+            fall = grown * (rows[_TOTAL + k] - count)
+            costs[k] = (
+                rows[_COST + k] - 2.0 * count * math.log(rows[_INVERSE + k]) + rows[_LOGS_SUM + k] - fall
+            )
+            rows[_INVERSE + k] *= math.exp(-grown)
+            away = max(away, abs(grown))
+        if away < same:
+            break
 
 
 @compiled(
     "void(float64[::1], boolean[::1], int64[::1], float64[:, ::1], float64[::1], float64[::1], "
-    "float64[:, ::1], float64[::1])"
+    "float64[:, ::1], float64[::1], float64)"
 )
 def _rate(
     values: Floats,
@@ -386,6 +473,7 @@ def _rate(
     rows: Floats,
     size: Floats,
     costs: Floats,
+    same: float,
 ) -> None:
     """Minus twice the logarithm of the likelihood of increments, at the scales of most likelihood.
 
@@ -398,6 +486,7 @@ def _rate(
         rows: room for what belongs to each lane, shape (`_ROWS` * lanes,).
         size: room for the sizes of the innovations, shape (n, lanes).
         costs: the result, shape (lanes,).
+        same: see `_find_scales`.
     """
     lanes, count = shares.size, values.size
     for k in range(lanes):
@@ -417,46 +506,4 @@ def _rate(
             _take_logs(rows, lanes)
     for k in range(lanes):
         rows[_INVERSE + k] = 1.0 / max(_MEAN_SIZE * rows[_INVERSE + k] / count, 1e-12)
-    for _ in range(_SCALE_ROUNDS):
-        if _scale(rows, lanes, size, costs) < _SAME_SCALE:
-            break
-
-
-@compiled(
-    "void(float64[:, ::1], boolean[::1], float64[::1], float64, float64, float64, float64[:, ::1], "
-    "float64[:, ::1], float64[::1])"
-)
-def _walk(
-    values: Floats,
-    fresh: Flags,
-    spans: Floats,
-    step_s: float,
-    phi: float,
-    share: float,
-    state: Floats,
-    made: Floats,
-    deviations: Floats,
-) -> None:
-    """Kalman filter of a disturbance and the error of the last pose; see the module for the equations."""
-    noise, decay = 1.0 - share, math.log(max(phi, 1e-300)) / step_s
-    of_a, of_both, of_n, span, keep = share, 0.0, noise, 0.0, 1.0
-    for row in range(values.shape[0]):
-        if fresh[row]:
-            of_a, of_both, of_n = share, 0.0, noise
-            for column in range(values.shape[1]):
-                state[0, column], state[1, column] = 0.0, 0.0
-        variance = of_a + of_n - 2.0 * of_both + noise
-        gain_a, gain_n = (of_a - of_both) / variance, noise / variance
-        if spans[row] != span:
-            span = spans[row]
-            keep = math.exp(decay * span)
-        for column in range(values.shape[1]):
-            fresh_part = values[row, column] - state[0, column] + state[1, column]
-            made[row, column] = fresh_part
-            state[0, column] = keep * (state[0, column] + gain_a * fresh_part)
-            state[1, column] = gain_n * fresh_part
-        deviations[row] = math.sqrt(variance)
-        after = of_a - gain_a * gain_a * variance
-        of_both = -keep * gain_a * gain_n * variance
-        of_n = noise - gain_n * gain_n * variance
-        of_a = keep * keep * after + (1.0 - keep * keep) * share
+    _find_scales(rows, size, costs, same)

@@ -39,7 +39,8 @@ def pick_columns(columns: Floats, places: Sequence[int]) -> Floats:
 
 def flatten(columns: Floats) -> Floats:
     """Columns as those of a matrix, shape (3 n, p)."""
-    return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])
+    windows, channels, numbers = columns.shape
+    return columns.transpose(2, 0, 1).reshape(numbers, windows * channels).T
 
 
 def combine_columns(columns: Floats, step: Floats) -> Floats:
