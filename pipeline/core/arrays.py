@@ -39,7 +39,8 @@ def recur(values: Floats, factors: Floats) -> Floats:
         values: v, shape (n,) or (n, c).
         factors: f of the rows after the first, shape (n - 1,).
     """
-    bands = np.ones((2, values.shape[0]))
+    # LAPACK takes columns: rows would be copied.
+    bands = np.ones((2, values.shape[0]), order="F")
     bands[1, :-1] = -factors
     solved, _ = scipy.linalg.lapack.dtbtrs(bands, values, uplo="L", diag="U")
     return np.asarray(solved, dtype=np.float64)

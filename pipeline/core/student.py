@@ -14,10 +14,12 @@ LOG_PEAK = math.log(0.375)
 def find_scale(rest: Floats) -> float:
     """Scale of some residuals by reweighting."""
     squares = np.square(rest)
-    power = max(1.5 * float(np.median(squares)), 1e-16)
+    power, weighed = max(1.5 * float(np.median(squares)), 1e-16), np.empty_like(squares)
     for _ in range(12):
-        total = np.add.reduce(squares / (FREEDOM + squares / power))
-        power = max((FREEDOM + 1.0) * float(total / squares.size), 1e-16)
+        np.divide(squares, power, out=weighed)
+        weighed += FREEDOM
+        np.divide(squares, weighed, out=weighed)
+        power = max((FREEDOM + 1.0) * float(np.add.reduce(weighed) / squares.size), 1e-16)
     return math.sqrt(power)
 
 
