@@ -330,20 +330,17 @@ class Model:
         with threadpool_limits(1):
             tries = Tries(problem, model, run.find_suggestion(problem.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
+        without = errors_as_json(tries.before)
         rows = [
             {
                 "effect": one.effect.id,
                 "sentence": one.effect.describe_motion(problem.vehicle, model),
-                **{name: number for name, number in errors_as_json(one.errors).items() if name in _OVER_2S},
-                **{
-                    f"{name[0]}_removed": find_share_removed(
-                        getattr(one.errors, name), getattr(tries.before, name), 0.0
-                    )
-                    for name in _OVER_2S
-                },
+                **{name: errors[name] for name in _OVER_2S},
+                **{f"{name[0]}_removed": _find_removed(errors, without, name) for name in _OVER_2S},
                 "same_as": list(one.twins),
             }
             for one in helping
+            for errors in [errors_as_json(one.errors)]
         ]
         numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
         texts = {"effect": pl.String, "sentence": pl.String}
@@ -401,6 +398,12 @@ class Model:
     def _repr_html_(self) -> str:
         ids = ", ".join(self.file.model.ids) or "the ideal model, no effect"
         return write_html(f"{self.file.model.vehicle.name}: {ids}", self.parameters)
+
+
+def _find_removed(after: Mapping[str, object], before: Mapping[str, object], name: str) -> float | None:
+    """Share of an error that is removed, of the numbers as they are said."""
+    error, without = number_in(after, name), number_in(before, name)
+    return None if error is None or without is None else find_share_removed(error, without, 0.0)
 
 
 def _take_effect(given: object) -> Effect:
