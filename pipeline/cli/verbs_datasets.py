@@ -108,8 +108,7 @@ def _compare_causes(
 ) -> int:
     from pipeline.datasets import (  # noqa: PLC0415 - heavy
         find_causes,
-        format_difference,
-        format_tests,
+        list_differences,
         name_causes,
         summarize_causes,
     )
@@ -127,9 +126,7 @@ def _compare_causes(
         rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
         lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
     lines += [""] * bool(causes.differences)
-    for one in causes.differences if everything else causes.differences[:_FEW]:
-        tests = format_tests(one, names)
-        lines += [format_difference(one, names), *([f"  {tests}"] if tests else [])]
+    lines += list_differences(causes.differences if everything else causes.differences[:_FEW], names)
     if not everything and len(causes.differences) > _FEW:
         lines.append(f"{len(causes.differences) - _FEW} more differences (--all, page)")
     page = _find_page(written, "causes.html")

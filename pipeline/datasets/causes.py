@@ -120,7 +120,7 @@ class Difference:
     note: str
 
     def describe(self, names: Mapping[str, str]) -> str:
-        """Describe the difference in words.
+        """Describe the difference in words, and which of its parts are significant.
 
         Args:
             names: display name of each cause.
@@ -128,25 +128,29 @@ class Difference:
         largest = max((abs(part.difference) for part in self.parts), default=0.0)
         if largest == 0.0:
             return f"{self.b} and {self.a}: the same slip, and the same from each cause"
+        start = f"{self.b} has {format_two(self.total)} m/s more RMS slip than {self.a}"
+        sure = [names[part.name] for part in self.parts if part.p_adjusted <= LEVEL]
+        end = f"; significant: {', '.join(sure) or 'none'}" * any(
+            math.isfinite(part.p) for part in self.parts
+        )
         if largest > self.total:
             # A single cause exceeds the total difference: shares would be meaningless.
             words = ", ".join(
-                f"{part.difference:+.2g} {names[part.name]}"
+                f"{'+' * (part.difference >= 0.0)}{format_two(part.difference)} {names[part.name]}"
                 for part in self.parts
                 if abs(part.difference) >= _LEAST_SHOWN * largest
             )
-            slip = f"{format_two(self.total)} m/s more RMS slip"
-            return f"{self.b} has {slip} than {self.a}; by cause in m/s: {words}"
+            return f"{start}; by cause in m/s: {words}{end}"
         main_parts = [part for part in self.parts if abs(part.difference) >= _LEAST_SHOWN * self.total]
         none = [names[part.name] for part in self.parts if abs(part.difference) < _NO_PART * self.total]
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
         )
         rest = f"; no contribution: {', '.join(name_first(none))}" if none else ""
-        return f"{self.b} has {format_two(self.total)} m/s more RMS slip than {self.a}: {words}{rest}"
+        return f"{start}: {words}{rest}{end}"
 
     def describe_tests(self, names: Mapping[str, str]) -> str:
-        """How the causes were tested and which are significant, or why none was tested.
+        """By which tests the causes were compared; where none was possible, why, and what intervals are of.
 
         Args:
             names: display name of each cause.
@@ -159,10 +163,8 @@ class Difference:
         for part in judged:
             causes.setdefault(part.method, []).append(names[part.name])
         usual = max(causes, key=lambda method: len(causes[method]))
-        said = [f"tested by {usual}"]
-        said += [f"{', '.join(own)} by {method}" for method, own in causes.items() if method != usual]
-        sure = [names[part.name] for part in judged if part.p_adjusted <= LEVEL]
-        return "; ".join([*said, f"significant after Holm: {', '.join(sure) or 'none'}"])
+        others = [f"; {', '.join(own)} by {method}" for method, own in causes.items() if method != usual]
+        return f"tested by {usual}{''.join(others)}; p after Holm over the causes of a pair"
 
 
 def compare_causes(
@@ -433,7 +435,7 @@ def summarize_causes(causes: Causes) -> dict[str, object]:
                 "unit_of_analysis": one.unit,
                 "note": one.note or None,
                 "sentence": format_difference(one, causes.names),
-                "tests": format_tests(one, causes.names) or None,
+                "tests": one.describe_tests(_name_parts(one, causes.names)),
             }
             for one in causes.differences
         ],
@@ -462,9 +464,13 @@ def format_difference(one: Difference, names: Mapping[str, str]) -> str:
     return one.describe(_name_parts(one, names))
 
 
-def format_tests(one: Difference, names: Mapping[str, str]) -> str:
-    """How a difference was tested, with effects named by their levels; empty without more to say."""
-    return one.describe_tests(_name_parts(one, names))
+def list_differences(differences: Sequence[Difference], names: Mapping[str, str]) -> list[str]:
+    """Texts of differences, and after all those that were tested alike how they were."""
+    by_tests: dict[str, list[str]] = {}
+    for one in differences:
+        tests = one.describe_tests(_name_parts(one, names))
+        by_tests.setdefault(tests, []).append(format_difference(one, names))
+    return [text for tests, texts in by_tests.items() for text in (*texts, tests[:1].upper() + tests[1:])]
 
 
 def _name_parts(one: Difference, names: Mapping[str, str]) -> dict[str, str]:

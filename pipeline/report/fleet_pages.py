@@ -33,8 +33,7 @@ from pipeline.datasets import (
     PassEffect,
     TerrainMap,
     fit_results,
-    format_difference,
-    format_tests,
+    list_differences,
     list_features,
     name_causes,
     summarize_fleet,
@@ -428,18 +427,14 @@ def render_causes(causes: Causes) -> str:
             format_count(len(keys), "run"),
             f"slip {INPUT_WORDS[causes.input]}",
         ],
-        sentence_list=[_format_one(one, names) for one in shown],
-        doubtful=[_format_one(one, names) for one in others],
+        sentence_list=list_differences(shown, names),
+        doubtful=list_differences(others, names),
+        folded=len(others),
         budgets=_tabulate_budgets(budgets, names),
         differences=_tabulate_differences(causes.differences, names),
         notes=causes.notes,
         runs=keys,
     )
-
-
-def _format_one(one: Difference, names: Mapping[str, str]) -> str:
-    tests = format_tests(one, names)
-    return format_difference(one, names) + (f". {tests[:1].upper()}{tests[1:]}" if tests else "")
 
 
 def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
