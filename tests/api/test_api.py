@@ -81,10 +81,11 @@ def test_what_a_suggested_formula_leaves_is_one_number_on_every_face(tmp_path: P
     assert suggestion is not None
     errors = (model + suggestion).fit(run).errors
     assert isinstance(told, dict)
-    assert told["with_formula"] == errors
     best = model.missing(run).row(0, named=True)
     assert best["effect"] == suggestion.id
-    assert (best["t_mrmse_m"], best["r_mrmse_rad"]) == (errors["t_mrmse_m"], errors["r_mrmse_rad"])
+    for key in ("t_mrmse_m", "r_mrmse_rad"):
+        assert told["with_formula"][key] == pytest.approx(errors[key], rel=1e-4)
+        assert best[key] == pytest.approx(errors[key], rel=1e-4)
 
 
 def test_what_the_analysis_found_is_not_looked_for_again(
