@@ -1,8 +1,8 @@
-"""Across runs and grounds: joint fits, fits with a prior from other runs, and bands of predictions.
+"""Across runs and grounds: fits with a prior from other runs, and bands of predictions.
 
 A joint fit of one model to many runs has noise of the same kind in all of them, and of each run's own size
 (`noise.Noise`): a gentle run counts as much as a fast one, whose residuals are larger by a factor of ten.
-Runs on other grounds than the requested one count less.
+Runs on other grounds than the requested one may count less (`parts.weigh_runs`).
 
 A ground parameter has one value per ground, shared by the runs on it; all other parameters belong to the
 vehicle and have one value.
@@ -18,73 +18,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.core import CONFIDENCE, Floats, Ints, format_share
 from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.decision import list_costs
-from pipeline.estimation.fit import PartFit, invert
 from pipeline.estimation.held_out import HeldOut, number_predictions
 from pipeline.estimation.parts import tie_prior
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import Prior, State
 from pipeline.models import LEAST_WAY_M, Bands
-
-if TYPE_CHECKING:
-    from pipeline.estimation.noise import Noise
-    from pipeline.estimation.parts import Part
-
-
-_ITERATIONS = 20
-"""Maximum number of steps of a joint fit: a safeguard, `_ENOUGH` ends it."""
-_DAMPINGS = (1e-6, 1e-2, 1e1)
-"""Damping relative to the diagonal, tried in turn until a step lowers the cost: nearly Gauss-Newton first,
-nearly steepest descent last."""
-_ENOUGH = 0.01
-"""Fall of chi-square below which a fit ends."""
-
-
-def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None) -> PartFit:
-    """Fit the shared parameters of runs on one part of the path, from their current values, and run delays.
-
-    Args:
-        part: part of the path, of several runs.
-        state: effects with the values to start from.
-        run_weights: weight of each run, shape (runs,); equal by default.
-    """
-    shares = np.ones(len(part.comparisons)) if run_weights is None else run_weights
-    free = tuple(number for number in part.list_free(state) if number.is_smooth)
-    residual = part.find_residuals(state)
-    best = PartFit(
-        part, state, free, residual, part.differentiate(state, residual, free), part.learn(residual)
-    )
-    for _ in range(_ITERATIONS if free else 0):
-        white, share = best.white, shares[part.run[best.white.rows]]
-        columns = white.columns
-        normal, pull = (columns * share[:, None]).T @ columns, columns.T @ (share * white.residual)
-        cost = _sum_costs(part, best.noise, residual, shares)
-        for damping in _DAMPINGS:
-            step = invert(normal + damping * np.diag(np.diag(normal))) @ pull
-            moved = best.state.move(free, step.tolist())
-            tried = part.find_residuals(moved)
-            if (reached := _sum_costs(part, best.noise, tried, shares)) < cost:
-                break
-        else:
-            break
-        residual = tried
-        columns_of_moved = part.differentiate(moved, residual, free)
-        best = PartFit(part, moved, free, residual, columns_of_moved, part.learn(residual, best.noise))
-        if cost - reached < _ENOUGH:
-            break
-    return replace(best, state=best.state.centred)
-
-
-def _sum_costs(part: Part, noise: Noise, residual: Floats, shares: Floats) -> float:
-    """Cost of the innovations, each run by its share."""
-    return float((list_costs(part, noise, residual) * shares[part.run]).sum())
 
 
 def tie_to_prior(problem: Problem, numbers: Mapping[str, tuple[float, float]]) -> Problem:

@@ -8,7 +8,7 @@ by anything after it. Models are compared by their likelihood less `PRICE` for e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -269,8 +269,7 @@ class Search:
         """The fit from a state; made once."""
         key = _make_key(state)
         if key not in self._fits:
-            fit = fit_part(self.part, state, noise=noise)
-            self._fits[key] = replace(fit, state=fit.state.centred)
+            self._fits[key] = fit_part(self.part, state, noise=noise)
         return self._fits[key]
 
     def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:

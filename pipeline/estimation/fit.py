@@ -49,13 +49,13 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class White:
-    """Innovations of a fit, weighted by Huber's weights, in one column of rows.
+    """Innovations of a fit, weighted by Huber's weights and those of the runs, in one column of rows.
 
     Attributes:
         residual: shape (m,).
         columns: of the fit's numbers, shape (m, p).
         rows: step of each, shape (m,).
-        weights: square roots of Huber's weights, shape (n, 3), by which other columns are multiplied.
+        weights: square roots of the weights, shape (n, 3), by which other columns are multiplied.
     """
 
     residual: Floats
@@ -115,9 +115,8 @@ class PartFit:
     def score(self) -> float:
         """Minus twice the logarithm of the likelihood: smaller is better, also between kinds of noise."""
         part = self.part
-        return measure_cost(part, self.noise, self.state, self.free, self.residual) + self.noise.log_variance(
-            part.steps
-        )
+        cost = measure_cost(part, self.noise, self.state, self.free, self.residual)
+        return cost + self.noise.log_variance(part.steps, part.weight)
 
     @cached_property
     def overdispersion(self) -> float:
@@ -144,7 +143,7 @@ class PartFit:
 def whiten(part: Part, noise: Noise, residual: Floats, columns: Floats) -> White:
     """Weighted innovations of a residual (n, 3) and of columns (n, 3, p)."""
     made = noise.whiten(residual[:, :, None], part.steps)
-    weights: Floats = np.sqrt(CLIP / np.maximum(np.abs(made[:, :, 0]), CLIP))
+    weights: Floats = np.sqrt(part.weight * (CLIP / np.maximum(np.abs(made[:, :, 0]), CLIP)))
     flat = _line_up(made * weights[:, :, None], noise)[:, 0]
     rows = np.repeat(np.arange(residual.shape[0]), len(noise.known))
     return White(flat, _line_up(noise.whiten(columns, part.steps, weights), noise), rows, weights)
@@ -210,6 +209,8 @@ def fit_part(
 ) -> PartFit:
     """Fit all numbers of a state to one part of the path, with the noise of its residuals.
 
+    What belongs to each run alone has the mean over the runs as its shared value then.
+
     Args:
         part: part of the path.
         start: state to start from.
@@ -226,7 +227,7 @@ def fit_part(
         fit = _walk_grids(fit, exact=exact)
         if before - fit.score < _ENOUGH:
             break
-    return fit
+    return replace(fit, state=fit.state.centred)
 
 
 def _begin(
@@ -264,19 +265,20 @@ def approach(base: PartFit, start: State) -> PartFit:
         acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
         start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
     fit = _begin(part, start, base.noise)
-    return _walk_grids(_descend(fit, _FEW_STEPS)) if fit.free else fit
+    return _walk_grids(_descend(fit, rough=True)) if fit.free else fit
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
     """Huber's cost of innovations, and that of the prior."""
-    innovations = noise.whiten(residual[:, :, None], part.steps)
-    return float(huber_cost(innovations).sum()) + part.prior.cost(state, free)
+    innovations = noise.whiten(residual[:, :, None], part.steps)[:, :, 0]
+    return float((part.weight * huber_cost(innovations)).sum()) + part.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, most: int = _MOST_STEPS, *, exact: bool = False) -> PartFit:
+def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False) -> PartFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
-    Its derivatives are those of where it ends, or of where all further steps together were no news.
+    Its derivatives are those of where it ends, or of where all further steps together were no news. A rough
+    one takes few steps and leaves them as they were before the last one.
     """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
     damping, gained, fallen, is_stale = _LOOSEST, 0.0, 0.0, False
@@ -284,7 +286,7 @@ def _descend(fit: PartFit, most: int = _MOST_STEPS, *, exact: bool = False) -> P
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-    for _ in range(most if fit.smooth else 0):
+    for _ in range((_FEW_STEPS if rough else _MOST_STEPS) if fit.smooth else 0):
         if is_stale:
             columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
             fit, gained, is_stale = replace(fit, columns=columns), 0.0, False
@@ -309,7 +311,7 @@ def _descend(fit: PartFit, most: int = _MOST_STEPS, *, exact: bool = False) -> P
             damping, fallen = _LOOSEST, 0.0
         elif not is_stale:
             break
-    if gained > near and most == _MOST_STEPS:
+    if gained > near and not rough:
         fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
     return fit
 

@@ -116,14 +116,10 @@ def _fit_from(problem: Problem, part: Part, state: State, per_run: Sequence[str]
             # Values that the start does not change may be fitted here.
             extended = extended if started is None else extended.add(effect.change(**started.values))
         fit = fit_part(part, extended, noise=fit.noise, per_run=per_run)
-    if exact:
-        fit = fit_part(part, fit.state, per_run=per_run, exact=True)
-        fit = _write_down(fit)
-    return replace(fit, state=fit.state.centred)
+    return _write_down(fit_part(part, fit.state, per_run=per_run, exact=True)) if exact else fit
 
 
 def _write_down(fit: PartFit) -> PartFit:
     """The fit at values as model files have them."""
-    part, state = fit.part, fit.state.hold([effect.rounded for effect in fit.state.effects])
-    residual = part.find_residuals(state)
-    return replace(fit, state=state, residual=residual)
+    state = fit.state.hold([effect.rounded for effect in fit.state.effects])
+    return replace(fit, state=state.centred, residual=fit.part.find_residuals(state))

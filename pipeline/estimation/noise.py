@@ -142,11 +142,17 @@ class Noise:
         gains = steps.find_gains(self.step_s, self.correlation, self.share)
         return _filter(columns, steps, gains, weights / (gains[:, _DEVIATION] * self.scale[steps.run]))
 
-    def log_variance(self, steps: Steps) -> float:
-        """Sum of the logarithms of the innovations' variances: what a likelihood has beside its squares."""
+    def log_variance(self, steps: Steps, weights: Floats | float = 1.0) -> float:
+        """Sum of the logarithms of the innovations' variances: what a likelihood has beside its squares.
+
+        Args:
+            steps: the steps.
+            weights: of each, shape (n, 1).
+        """
         gains = steps.find_gains(self.step_s, self.correlation, self.share)
         spreads = gains[:, _DEVIATION] * self.scale[steps.run]
-        return 2.0 * float(np.log(spreads[np.isfinite(spreads)]).sum())
+        known = np.isfinite(spreads)
+        return 2.0 * float((np.broadcast_to(weights, spreads.shape)[known] * np.log(spreads[known])).sum())
 
 
 def learn_noise(

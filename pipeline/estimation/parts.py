@@ -68,6 +68,7 @@ class Part(ABC):
         unit: of its stretch of ten seconds, shape (n,).
         channels: indices of the informative ones of x, y, turn.
         prior: of the parameters.
+        weight: of each step in a fit, shape (n, 1); one number where all runs count alike.
         dates_poses: whether its fixed clocks are those of the poses.
         clocks: ids of effects that are a clock of each single run.
         grounds: numbers of the runs on each ground; one empty group where all are on one.
@@ -75,6 +76,7 @@ class Part(ABC):
     """
 
     prior: Prior = NO_PRIOR
+    weight: Floats | float = 1.0
     dates_poses: bool = True
     is_delayed: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
@@ -375,6 +377,13 @@ def _group_by_ground(comparisons: Sequence[Comparison]) -> tuple[tuple[int, ...]
         tuple(run for run, one in enumerate(terrains) if one == name) for name in dict.fromkeys(terrains)
     )
     return tuple(groups) if len(set(terrains)) > 1 else ((),)
+
+
+def weigh_runs(part: Part, shares: Floats) -> Part:
+    """The same part with runs that count by their shares in its fits, shape (runs,)."""
+    weighed = copy(part)
+    weighed.weight = shares[part.run][:, None]
+    return weighed
 
 
 def tie_prior(part: Part, prior: Prior) -> Part:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core import Floats, SlipError, format_count
+from pipeline.core import SlipError, format_count
 from pipeline.datasets import (
     Forecast,
     expect_values,
@@ -21,11 +21,10 @@ from pipeline.datasets import (
     list_held,
 )
 from pipeline.estimation import Recording
-from pipeline.estimation.across_runs import fit_part_jointly
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
-from pipeline.estimation.fit import PartFit
-from pipeline.estimation.parts import Part
+from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.parts import weigh_runs
 from pipeline.estimation.problem import Problem
 from pipeline.logs import LogError, locate_recorded, open_log
 from pipeline.models import Effect, Late, Model, list_effects
@@ -84,18 +83,18 @@ def forecast_deployment(
     problem = Problem([run for run, _ in runs], geometry, Input(source))
     clocks = [effect for effect in held if effect.late is Late.POSES]
     shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in problem.runs])
-    fits: list[tuple[Part, PartFit]] = []
+    fits: list[PartFit] = []
     also: list[str] = []
     timing = problem.start_state().timing
-    for part in problem.parts:
+    for part in (weigh_runs(one, shares) for one in problem.parts):
         mine = [effect for effect in (*start.effects, *clocks) if part.owns(effect)]
         active = problem.active_effects(Model(geometry, tuple(mine)))
         # The delays of the encoders follow from the body: the drivetrain moves wheels before they report it.
         state = replace(problem.start_state(active), timing=timing)
-        fit = _add_held(part, fit_part_jointly(part, state, shares), held, shares)
+        fit = _add_held(fit_part(part, state), held)
         also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
         timing = fit.state.timing
-        fits.append((part, fit))
+        fits.append(fit)
     if also:
         start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
     return expect_values(start, read_values(problem, fits, terrain))
@@ -113,22 +112,22 @@ def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehic
                 yield run, vehicle
 
 
-def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) -> PartFit:
+def _add_held(fit: PartFit, held: Sequence[Effect]) -> PartFit:
     """Extend the fit with effects of some stored models if they lower the misfit over all runs."""
     for effect in held:
         taken = any(
             effect.id == one.id or effect.id in one.contains or one.id in effect.contains
             for one in fit.state.effects
         )
-        if taken or not part.owns(effect):
+        if taken or not fit.part.owns(effect):
             continue
-        extended = fit_part_jointly(part, fit.state.add(effect), shares)
+        extended = fit_part(fit.part, fit.state.add(effect))
         if find_cost(extended) < find_cost(fit):
             fit = extended
     return fit
 
 
-def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain: str) -> Mapping[str, float]:
+def read_values(problem: Problem, fits: Sequence[PartFit], terrain: str) -> Mapping[str, float]:
     """Values of the joint fits by label; a terrain parameter has its value on this terrain.
 
     For a terrain without runs it is the median over the other terrains, which is robust against an unusual
@@ -137,7 +136,7 @@ def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain:
     first = {run.terrain: number for number, run in reversed([*enumerate(problem.runs)])}
     runs = [first[terrain]] if terrain in first else [*first.values()]
     values: dict[str, float] = {}
-    for _, fit in fits:
+    for fit in fits:
         for number in fit.free:
             if number.effect:
                 acting = (replace(number, runs=(run,)) for run in runs)
