@@ -211,11 +211,13 @@ def _write_outputs(
     verdict: str,
 ) -> None:
     """Write summary, report and figures of a finished run."""
-    from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
-
     summary = summarize_run(work, log)
     summary["verdict"] = verdict
-    summary["diagnosis"] = None if diagnosis is None else diagnosis_as_json(diagnosis)
+    summary["diagnosis"] = None
+    if diagnosis is not None:
+        from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
+
+        summary["diagnosis"] = diagnosis_as_json(diagnosis)
     summary["report"] = REPORT if options.report else None
     summary["provenance"] = {
         "version": read_version(),

@@ -21,7 +21,7 @@ from pipeline.estimation.stored_diagnosis import (
 )
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.recording.log_setup import LogSetup
-from pipeline.results import Finding, RunDiagnosis, read_findings, read_result, to_json
+from pipeline.results import Finding, RunDiagnosis, find_refusal, read_findings, read_result, to_json
 from pipeline.stages import SUMMARY_DIGITS, list_wanted, pick_row, round_number, summarize_inputs
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store, StoreError, load_manifest
 
@@ -123,11 +123,12 @@ def judge_run(findings: pl.DataFrame, diagnosis: RunDiagnosis | None) -> str:
         findings: the run's findings.
         diagnosis: None if it was not requested.
     """
+    found = read_findings({"findings": findings.to_dicts()}) if diagnosis is None else diagnosis.findings
+    if diagnosis is None and not find_refusal(found):
+        return ""
     from pipeline.words import format_refusal, format_verdict  # noqa: PLC0415 - heavy
 
-    if diagnosis is None:
-        return format_refusal(read_findings({"findings": findings.to_dicts()}))
-    return format_verdict(diagnosis)
+    return format_refusal(found) if diagnosis is None else format_verdict(diagnosis)
 
 
 def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:

@@ -16,7 +16,6 @@ from pipeline.datasets.pooling import (
     measure_difficulty,
 )
 from pipeline.estimation.stored_diagnosis import DIAGNOSED
-from pipeline.models import list_effects
 from pipeline.results import find_refusal, read_findings
 from pipeline.run import GROUND_UNOBSERVABLE
 from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
@@ -65,6 +64,8 @@ class ComparedRuns:
 
     def read_estimates(self) -> pl.DataFrame:
         """Rows of `estimates` of effects as they are in the catalogue: older runs may have others."""
+        from pipeline.models import list_effects  # noqa: PLC0415 - heavy
+
         known = [f"{effect.id}.{number.name}" for effect in list_effects() for number in effect.parameters]
         label = pl.concat_str(pl.col("effect", "parameter").cast(pl.String), separator=".")
         return self.scan("estimates").filter(label.is_in(known).all().over("run", "effect")).collect()
