@@ -132,6 +132,29 @@ def summarize_error(path: str, error: SlipError) -> dict[str, str]:
     return {"path": path, "code": error.code, "message": f"{error.what}{where}", "hint": error.hint}
 
 
+def format_counts(counts: Mapping[str, int], width: int = 0) -> list[str]:
+    """How many logs came out in each state, in a column of a width; none refused is nothing to say."""
+    return [
+        f"{format_state(state):<14}{count:>{width}}"
+        for state, count in counts.items()
+        if count or state != "refused"
+    ]
+
+
+EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
+"""States of logs that need a look, in the order in which they are listed."""
+
+
+def explain_logs(title: str, logs: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Paths of logs, why they came out so, and what to do, below a title; nothing without any."""
+    lines = [
+        text
+        for path, reason, hint in logs
+        for text in (f"  {path}", f"      {reason}", *([f"      {hint}"] if hint else []))
+    ]
+    return ["", title, *lines] if lines else []
+
+
 def format_state(state: str) -> str:
     """What a log came out as, in words."""
     words = {"lossy": "with losses", "copy": "copies", "growing": "being written"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -23,10 +24,13 @@ from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
     ALERT,
     CLEAN,
+    EXPLAINED,
     FAILED,
     LOSSY,
     Choices,
     build_options,
+    explain_logs,
+    format_counts,
     format_state,
     open_results,
     print_error,
@@ -43,7 +47,6 @@ if TYPE_CHECKING:
     from pipeline.models import ModelFile
 
 _MEMORY_SHARE = 0.8
-_EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
 
 
 def build_batch() -> App:
@@ -261,36 +264,26 @@ def _as_json(outcome: Outcome, after: _After) -> dict[str, object]:
 
 def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
-    counts = {state: count for state, count in outcome.counts.items() if count or state != "refused"}
-    lines = [f"{format_state(state):<14}{count:>6}" for state, count in counts.items()]
-    for state in ("growing", "left", "skipped"):
-        count = sum(line.state == state for line in outcome.lines)
-        lines += [f"{format_state(state):<14}{count:>6}"] if count else []
+    states = Counter(line.state for line in outcome.lines)
+    rare = {state: states[state] for state in ("growing", "left", "skipped") if states[state]}
+    lines = format_counts({**outcome.counts, **rare}, width=6)
     fetched = sum(line.fetched_bytes for line in outcome.lines)
     if fetched:
         whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
         lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    for state in _EXPLAINED:
-        noted = [line for line in outcome.lines if state in _list_notes(line)]
-        if noted:
-            lines += ["", format_state(state), *(text for line in noted for text in _explain(line))]
-    copies = [line for line in outcome.lines if _list_notes(line) == ["unchanged"] and line.reason]
-    if copies:
-        lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
-    return lines
+    noted = [(_list_notes(line), (line.path, line.reason, line.hint)) for line in outcome.lines]
+    for state in EXPLAINED:
+        lines += explain_logs(format_state(state), [row for states, row in noted if state in states])
+    copies = [row for states, row in noted if states == ["unchanged"] and row[1]]
+    return lines + explain_logs("copies, counted once", copies)
 
 
 def _list_notes(line: Line) -> list[str]:
     """State of a log, and notes on results that did not change."""
     notes = {"refused": line.refused, "lossy": line.lossy}
     return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]
-
-
-def _explain(line: Line) -> list[str]:
-    hint = [f"      {line.hint}"] if line.hint else []
-    return [f"  {line.path}", f"      {line.reason}", *hint]
 
 
 def schedule(  # noqa: D417 - arguments document themselves

@@ -15,8 +15,11 @@ from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import (
     CLEAN,
+    EXPLAINED,
     FAILED,
     Results,
+    explain_logs,
+    format_counts,
     format_state,
     open_results,
     print_result,
@@ -191,12 +194,10 @@ def _format_status(status_now: Status) -> list[str]:
         f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
         f"last batch    {last}",
     ]
-    counts = {state: count for state, count in status_now.counts.items() if count or state != "refused"}
-    lines += [f"{format_state(state):<14}{count}" for state, count in counts.items()]
-    for entry in status_now.entries:
-        if entry.state in {"lossy", "refused", "failed", "quarantined"}:
-            lines += ["", f"{format_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
-            lines += [f"    {entry.hint}"] if entry.hint else []
+    lines += format_counts(status_now.counts)
+    for state in EXPLAINED:
+        own = [one for one in status_now.entries if one.state == state]
+        lines += explain_logs(format_state(state), [(one.log.path, one.reason, one.hint) for one in own])
     lines += [f"damaged: {error}" for error in status_now.errors]
     return lines
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.core import format_length
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.score import CLEAR, fit
 from pipeline.sources import PoseContent
@@ -51,7 +52,8 @@ def report_mounting(case: Case, drives: Sequence[Candidate | None]) -> None:
         case.findings.append(Finding("pose_angle", "info", text, where="pose", value=angle))
     if abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and known[0].form != "steering":
         text = (
-            f"the body turns about a point {abs(lever):.2f} m (±{1.96 * abs(lever / of_lever):.1g}) "
+            f"the body turns about a point {format_length(abs(lever))} "
+            f"(±{format_length(1.96 * abs(lever / of_lever))}) "
             f"{'behind' if lever > 0.0 else 'ahead of'} that of the poses of {pose}: they are of a sensor "
             "that is mounted there, or the wheels do not grip alike front and rear"
         )
