@@ -123,12 +123,12 @@ def judge_run(findings: pl.DataFrame, diagnosis: RunDiagnosis | None) -> str:
         findings: the run's findings.
         diagnosis: None if it was not requested.
     """
-    found = read_findings({"findings": findings.to_dicts()}) if diagnosis is None else diagnosis.findings
-    if diagnosis is None and not find_refusal(found):
+    noted = read_findings({"findings": findings.to_dicts()}) if diagnosis is None else diagnosis.findings
+    if diagnosis is None and not find_refusal(noted):
         return ""
     from pipeline.words import format_refusal, format_verdict  # noqa: PLC0415 - heavy
 
-    return format_refusal(found) if diagnosis is None else format_verdict(diagnosis)
+    return format_refusal(noted) if diagnosis is None else format_verdict(diagnosis)
 
 
 def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
