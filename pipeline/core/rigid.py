@@ -64,9 +64,9 @@ def rotation_vectors(quaternion: Floats) -> Floats:
 
 def quaternions_from_vectors(vector: Floats) -> Floats:
     """Exponential of rotation vectors (n, 3) [rad]: unit quaternions (n, 4)."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - heavy
-
-    return np.asarray(Rotation.from_rotvec(np.array(vector)).as_quat())
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    # NumPy's sinc is that of pi x.
+    return np.concatenate((0.5 * np.sinc(angle / (2.0 * np.pi)) * vector, np.cos(0.5 * angle)), axis=-1)
 
 
 def quaternions_from_yaw(yaw: Floats) -> Floats:

@@ -478,11 +478,14 @@ def _list_terms(track: Track) -> Floats:
 
 def _take_off(track: Track, ages: Floats) -> Floats:
     """Stamps minus the ages, changed as little as their order and the way between poses require."""
-    from scipy.optimize import isotonic_regression  # noqa: PLC0415 - heavy
-
     least = np.append(0.0, np.cumsum(_find_least_waits(track)))
-    ordered: Floats = isotonic_regression(track.times - ages - least).x + least
-    return ordered
+    ordered, count = track.times - ages - least, np.ones(ages.size, dtype=np.int64)
+    # The nearest values in order: those that fall are pooled until none do.
+    while (falls := np.diff(ordered) < 0.0).any():
+        first = np.flatnonzero(np.append(True, ~falls))
+        total, count = (np.add.reduceat(each, first) for each in (ordered * count, count))
+        ordered = total / count
+    return np.asarray(np.repeat(ordered, count) + least, dtype=np.float64)
 
 
 def _find_least_waits(track: Track) -> Floats:
