@@ -100,6 +100,6 @@ def test_an_effect_that_undoes_another_is_not_named_and_no_formula_hides_the_off
 @pytest.mark.parametrize("run", ["green_06", "green_48"])
 def test_wheels_that_slip_on_a_smooth_floor_are_not_said_to_count_backward(run: str) -> None:
     """They turn the body three to five times as far as their odometry says, and the other way."""
-    shown = run_verb("inspect", published.PUBLISHED / "robotino_surfaces" / f"{run}.mcap")
+    shown = run_verb("inspect", published.PUBLISHED / "robotino_surfaces" / f"{run}.mcap", "--all")
     assert shown.returncode == 0
     assert "backward" not in shown.stdout
