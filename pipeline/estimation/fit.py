@@ -278,17 +278,19 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False) -> PartF
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
     Its derivatives are those of where it ends, or of where all further steps together were no news. A rough
-    one takes few steps and leaves them as they were before the last one.
+    one takes few steps and leaves them as they were before the last one. Where no step lowers the cost as
+    promised, central differences are tried once.
     """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
     damping, gained, fallen, is_stale = _LOOSEST, 0.0, 0.0, False
     near = 0.0 if exact else _NEWS
+    is_failing, is_central = False, exact or rough
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
     for _ in range((_FEW_STEPS if rough else _MOST_STEPS) if fit.smooth else 0):
         if is_stale:
-            columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
+            columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact or is_failing)
             fit, gained, is_stale = replace(fit, columns=columns), 0.0, False
         moving, step, promised = _solve(fit, damping)
         fall = 0.0
@@ -304,8 +306,11 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False) -> PartF
         elif gained <= near and promised >= enough and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
             continue
-        is_stale = gained > near
-        if fallen > most_fallen and not 0.0 < fall <= _NEWS:
+        # No step falls as promised: one-sided derivatives may be wrong where a limit is met.
+        is_failing = gained <= near and promised >= enough and not is_central
+        is_stale, is_central = gained > near or is_failing, is_central or is_failing
+        damping = _LOOSEST if is_failing else damping
+        if fallen > most_fallen and not (is_failing or 0.0 < fall <= _NEWS):
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
             cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
             damping, fallen = _LOOSEST, 0.0
