@@ -258,7 +258,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     if seen.choice is not None and seen.vehicle is not None:
         gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
         lines[-1] += f"{gear}    {format_vehicle_source(seen.choice.vehicle_source)}"
-    lines += _format_roles(seen)
+    lines += _format_roles(seen, everything=everything)
     notes = []
     if seen.sources is not None:
         notes += [f"choice    {note}" for note in seen.sources.notes if not note.startswith("pose")]
@@ -266,8 +266,6 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
         if everything:
             lines += _format_ratings(seen.choice.ratings)
             lines += _format_evidence(seen.choice.recording)
-        elif others := len(seen.choice.ratings) - 1:
-            lines += [f"          {format_count(others, 'other pose')} (--all)"] if others > 0 else []
         findings = sorted(seen.choice.findings, key=lambda one: one.severity == "info")
         notes += [f"note      {finding.text}" for finding in findings]
     lines += _cut(notes, everything=everything)
@@ -294,16 +292,20 @@ def _format_metadata(seen: Inspection) -> list[str]:
     ]
 
 
-def _format_roles(seen: Inspection) -> list[str]:
+def _format_roles(seen: Inspection, *, everything: bool) -> list[str]:
     """What each role is read from, and why."""
-    if seen.sources is None:
-        return []
-    used = {role: getattr(seen.sources, role) for role in _ROLES}
-    return [
-        f"{role:<10}{f'{source}    {source.reason}' if source else 'none'}"
-        for role, source in used.items()
-        if source or role not in {"interval", "power"}
-    ]
+    lines = []
+    for role in _ROLES if seen.sources else ():
+        if source := getattr(seen.sources, role):
+            lines.append(f"{role:<10}{source}    {source.reason}")
+        elif role not in {"interval", "power"}:
+            lines.append(f"{role:<10}none")
+        elif everything and role == "interval":
+            lines.append(f"{role:<10}none: the whole log counts")
+        others = len(seen.choice.ratings) - 1 if seen.choice else 0
+        if role == "pose" and others > 0 and not everything:
+            lines.append(f"          {format_count(others, 'other pose')} (--all)")
+    return lines
 
 
 def _format_count(seen: Inspection) -> str:

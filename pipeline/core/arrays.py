@@ -190,8 +190,9 @@ def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
 
 
 def integrate_rate(times: Floats, rate: Floats) -> Floats:
-    """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero."""
-    return np.append(0.0, np.cumsum(np.diff(times) * (rate[1:] + rate[:-1]) / 2.0))
+    """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero, shape (n,)."""
+    steps = np.diff(times) * (rate[1:] + rate[:-1]) / 2.0
+    return np.append(0.0, np.cumsum(steps))[: times.size]
 
 
 _GAUSSIAN = 1.4826

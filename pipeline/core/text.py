@@ -152,9 +152,12 @@ def format_digits(value: float, digits: int = 2) -> str:
 
 
 def format_two(value: float) -> str:
-    """A number of two significant digits, zeros included: 2.0 and 0.50."""
-    leading = math.floor(math.log10(abs(value))) if value else 0
-    return f"{value:.{max(1 - leading, 0)}f}"
+    """A number of two significant digits, zeros included: 2.0 and 0.50; 4.8e-10 for one that is tiny."""
+    text = f"{value:.1e}"
+    if not math.isfinite(value) or "e-" in f"{value:.2g}":
+        return text
+    leading = int(text.partition("e")[2])
+    return f"{value:z.{max(1 - leading, 0)}f}"
 
 
 _LEAST_UNITS = 3.55

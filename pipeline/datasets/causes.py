@@ -129,10 +129,12 @@ class Difference:
         if largest == 0.0:
             return f"{self.b} and {self.a}: the same slip, and the same from each cause"
         start = f"{self.b} has {format_two(self.total)} m/s more RMS slip than {self.a}"
-        sure = [names[part.name] for part in self.parts if part.p_adjusted <= LEVEL]
-        end = f"; significant: {', '.join(sure) or 'none'}" * any(
-            math.isfinite(part.p) for part in self.parts
-        )
+        untested = [names[part.name] for part in self.parts if not math.isfinite(part.p)]
+        end = ""
+        if len(untested) < len(self.parts):
+            sure = [names[part.name] for part in self.parts if part.p_adjusted <= LEVEL]
+            end = f"; significant: {', '.join(sure) or 'none'}"
+            end += f"; not tested: {', '.join(untested)}" * bool(untested)
         if largest > self.total:
             # A single cause exceeds the total difference: shares would be meaningless.
             words = ", ".join(
@@ -297,7 +299,8 @@ def _compare(a: _Group, b: _Group) -> Difference:
         method = ""
         if single:
             half = float(np.hypot(half_first[0], half_second[0]))
-            low, high, method = difference - half, difference + half, _JACKKNIFE
+            low, high = difference - half, difference + half
+            method = _JACKKNIFE * math.isfinite(half)
         elif pool_spread([first, second])[1]:
             test = compare_means([first, second], [(0, 1)], tests=len(squares))
             # Zeros of a cause that no run has do not scatter: they tell no spread of the other side.

@@ -491,6 +491,8 @@ def _correlate(
         estimated: rows of `estimates` that each was drawn from.
         rng: random generator.
     """
+    if not numbers:
+        return []
     count = len(numbers)
     runs = sorted(set().union(*(rows["run"] for rows in estimated)))
     away = np.zeros((len(runs), count))

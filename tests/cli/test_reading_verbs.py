@@ -256,3 +256,12 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(place: Path)
     told = print_verb("model", "drop", "husky.toml", "drive_lag", "turn_lag", "--on", "field/wide")
     assert "  ! position error rises by " in told
     assert ": changed as requested" in told
+
+
+def test_what_is_left_out_of_a_log_stands_below_what_it_belongs_to(samples: Path) -> None:
+    usual = print_verb("inspect", samples / "mystery_3.mcap").splitlines()
+    (pose,) = (index for index, line in enumerate(usual) if line.startswith("pose "))
+    assert usual[pose + 1].strip() == "1 other pose (--all)"
+    whole = print_verb("inspect", samples / "mystery_3.mcap", "--all").splitlines()
+    assert "interval  none: the whole log counts" in whole
+    assert not any("(--all)" in line for line in whole)

@@ -97,6 +97,11 @@ def test_integrating_a_linear_rate_is_exact(offset: float, slope: float) -> None
     assert np.allclose(found, offset * times + slope * times**2 / 2.0)
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_an_integral_has_as_many_rows_as_its_times(count: int) -> None:
+    assert arrays.integrate_rate(np.zeros(count), np.ones(count)).tolist() == [0.0] * count
+
+
 def test_interpolation_holds_its_ends() -> None:
     values = np.array([[0.0, 1.0], [2.0, 3.0]])
     found = arrays.interpolate_linearly(np.array([-1.0, 0.5, 9.0]), np.array([0.0, 1.0]), values)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import format_part, format_share
+from pipeline.core import format_part, format_share, format_two
 
 PIPELINE = Path(__file__).parents[2] / "pipeline"
 
@@ -36,6 +36,27 @@ def test_a_share_is_percent_with_a_space(share: float, digits: int, text: str) -
 def test_a_part_of_a_whole_is_never_zero_unless_it_is() -> None:
     parts = {0.56: "56 %", 0.004: "0.4 %", -0.02: "-2 %", 3e-6: "< 0.1 %", -1e-4: "< 0.1 %", 0.0: "0 %"}
     assert {part: format_part(part) for part in parts} == parts
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0.0"),
+        (0.5, "0.50"),
+        (2.0, "2.0"),
+        (9.94, "9.9"),
+        (9.96, "10"),
+        (-0.0996, "-0.10"),
+        (99.6, "100"),
+        (1234.0, "1234"),
+        (0.00012, "0.00012"),
+        (4.8e-10, "4.8e-10"),
+        (math.nan, "nan"),
+        (-math.inf, "-inf"),
+    ],
+)
+def test_a_number_of_two_digits_has_two_after_rounding(value: float, text: str) -> None:
+    assert format_two(value) == text
 
 
 def test_no_module_writes_percent_by_itself() -> None:

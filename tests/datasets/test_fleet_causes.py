@@ -101,3 +101,14 @@ def test_a_cause_that_one_side_lacks_is_not_tested_by_the_spread_of_zeros(runs: 
     assert 0.0 < parts["disturbance"].p < 0.05
     assert parts["disturbance"].low < parts["disturbance"].difference < parts["disturbance"].high
     assert difference.note == ""
+    untested = difference.describe({name: name for name in parts}).partition("; not tested: ")[2]
+    assert set(untested.split(", ")) == {"wheel_radius", "turn_lag"}
+
+
+def test_an_interval_has_a_method_only_where_it_exists() -> None:
+    rows = pl.concat([draw("a", ASPHALT, 1), draw("b", ASPHALT, 1, seed=1)])
+    names = {name: name for name in ASPHALT}
+    for bounds, told in ((rows, True), (rows.with_columns(low=math.nan, high=math.nan), False)):
+        _, (difference,) = compare_causes(bounds)
+        assert {bool(part.method) for part in difference.parts} == {told}
+        assert ("intervals by jackknife" in difference.describe_tests(names)) == told

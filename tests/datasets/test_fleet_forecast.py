@@ -6,6 +6,7 @@ import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
 from pipeline.datasets.forecast import expect_values, fit_fleet, forecast_vehicle
+from pipeline.models import find_effect
 from pipeline.models.parameter import Level
 
 
@@ -53,6 +54,21 @@ def test_a_run_that_stands_apart_does_not_move_what_is_expected() -> None:
     number = forecast_vehicle(hurt, "warthog", "asphalt", "measured").numbers[0]
     assert number.value == pytest.approx(0.9, abs=0.03)
     assert number.runs == 11
+
+
+def test_where_no_two_runs_share_an_effect_none_is_expected() -> None:
+    effects = (
+        ("wheel_radius", "k"),
+        ("effective_track", "k"),
+        ("icr_offset", find_effect("icr_offset").parameters[0].name),
+    )
+    rows = [
+        draw({"ice": 1.1}, effect=effect, parameter=name).filter(pl.int_range(pl.len()) == index)
+        for index, (effect, name) in enumerate(effects)
+    ]
+    forecast = forecast_vehicle(pl.concat(rows), "warthog", "ice", "measured")
+    assert forecast.numbers == ()
+    assert forecast.effects == ()
 
 
 def test_draws_stay_within_the_bounds_of_the_search() -> None:
@@ -123,3 +139,15 @@ def test_numbers_that_vary_together_from_run_to_run_are_drawn_together() -> None
     assert correlations["many"] < -0.75
     assert abs(correlations["few"]) < 0.5
     assert abs(correlations["apart"]) < 0.5
+
+
+def test_an_outlying_run_has_no_part_in_how_numbers_vary_together() -> None:
+    track = draw({"ice": 1.8}, effect="effective_track", parameter="k", runs=9)
+    odd = pl.col("run").str.ends_with("_4")
+    radius = draw({"ice": 0.9}, runs=9, seed=1)
+    hurt = radius.with_columns(value=pl.when(odd).then(0.3).otherwise("value"))
+    draws = [
+        [one.draws.tolist() for one in forecast_vehicle(rows, "warthog", "ice", "measured").numbers]
+        for rows in (pl.concat([track, hurt]), pl.concat([track, radius.filter(~odd)]))
+    ]
+    assert draws[0] == draws[1]

@@ -47,9 +47,9 @@ def test_a_servo_comes_back_from_a_gentle_and_a_fast_run() -> None:
     begun = find_effect("wheel_servo")(**start)
     fit = fit_part(drive, problem.start_state([begun]))
     (found,) = fit.state.effects
-    # As likely as from the truth within a thousandth of a chi-square a step: its derivatives are one-sided.
+    # As likely as from the truth within two steps that are not worth taking.
     true = fit_part(drive, problem.start_state([find_effect("wheel_servo")(**HIDDEN)]))
-    assert fit.score <= true.score + 1e-3 * drive.spans.size
+    assert fit.score <= true.score + 0.1
     for name in ("tau", "reset", "scrub", "bound", "no_load"):
         assert found.values[name] == pytest.approx(HIDDEN[name], rel=0.2), name
 
