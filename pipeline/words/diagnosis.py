@@ -166,7 +166,7 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     falls = list_largest_falls(run)
     shown = [one for one in main if one.id not in undecided and falls.get(one.id) != _UNCHANGED]
     unseen = [one for one in main if falls.get(one.id) == _UNCHANGED and one.id not in undecided]
-    folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor) + len(small)
+    folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor)
     rows = [
         (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
         for effect in shown[:_EFFECTS_SHOWN]
@@ -179,8 +179,10 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     for item in felt:
         texts.append(f"Undecided: {name_group(item.candidates)}")
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
-    if folded:
-        texts.append(f"{folded} smaller effect{'s' * (folded > 1)} (--all)")
+    smaller = [f"{folded} smaller effect{'s' * (folded > 1)}"] if folded else []
+    smaller += [f"{len(small)} undecided"] if small else []
+    if smaller:
+        texts.append(f"{', and '.join(smaller)} (--all)")
     return texts
 
 
