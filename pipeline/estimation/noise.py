@@ -241,7 +241,7 @@ def _maximize(
 
     starts, radius = np.array([(1.22, 0.35), (0.79, 1.02)]), 0.3
     if known is not None and not exact:
-        starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.03
+        starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.06
     same = _SAME_EXACT if exact else _SAME
     best = min((_descend(rate, start, radius, same) for start in starts), key=lambda one: one[0])
     phi, part = read(best[1][None])
@@ -268,10 +268,9 @@ def _descend(
         step = axes @ -np.copysign(np.minimum(away, _FAR), along)
         terms = _list_terms(np.vstack((step, _AROUND))) @ (level, *slope, xx, xy, yy)
         missed = float(np.abs(costs - terms[1:]).max())
-        # What a quadratic misses on the circle moves its lowest place: by the square of that it is too high.
-        if math.hypot(*step) <= 1.0 and missed * min(1.0, missed / max(float(curvature[0]), 1e-300)) < same:
+        if max(least - float(terms[0]), missed) < same:
             # Not the best of eight points: which one that is depends on rounding.
-            return float(terms[0]), np.asarray(center + radius * step)
+            return least, np.asarray(center + radius * step)
         center = np.asarray(center + radius * step) if is_lower else where
         radius *= 1.0 if is_lower and math.hypot(*step) >= 1.0 else _CLOSER
     return least, where
