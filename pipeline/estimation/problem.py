@@ -141,7 +141,7 @@ class Problem:
     def with_parts(self, parts: tuple[Part, ...]) -> Problem:
         """The same runs with other parts, without cached results of the former ones."""
         problem = copy(self)
-        for name in ("behind_wheels", "whole", "folds", "training"):
+        for name in ("behind_wheels", "floor", "whole", "folds", "training"):
             problem.__dict__.pop(name, None)
         problem.parts = parts
         return problem

@@ -49,7 +49,9 @@ _SHAPES: Mapping[str, tuple[str, str]] = {
     "world_two": ("(a * sin(2 * yaw) + b * cos(2 * yaw)) * tanh(abs(v0) / u)", "1"),
     "speed_world": ("v0 * (a * sin(yaw) + b * cos(yaw))", "m/s"),
     "turn_world": ("w0 * (a * sin(yaw) + b * cos(yaw))", "rad/s"),
-    # Once a turn of a wheel, which is out of round or sits off its centre.
+}
+# Once a turn of a wheel, which is out of round or sits off its centre.
+_WHEEL_SHAPES: Mapping[str, tuple[str, str]] = {
     "left_wheel": ("left * (a * sin(left_angle) + b * cos(left_angle))", "rad/s"),
     "right_wheel": ("right * (a * sin(right_angle) + b * cos(right_angle))", "rad/s"),
 }
@@ -101,9 +103,14 @@ def _parse(term: Term) -> FormulaEffect:
     return FormulaEffect(term.id, {term.channel: term.text}, term.parameters, fixed=fixed)
 
 
-def list_terms(*, sideways: bool = False) -> tuple[Term, ...]:
-    """All terms; ``sideways`` of a vehicle that drives so, too."""
-    shapes = {**_SHAPES, **_SIDEWAYS_SHAPES} if sideways else _SHAPES
+def list_terms(*, sideways: bool = False, wheels: bool = False) -> tuple[Term, ...]:
+    """All terms.
+
+    Args:
+        sideways: also those of a vehicle that drives so.
+        wheels: also those of a wheel's turns: of one run, as in another it starts elsewhere.
+    """
+    shapes = {**_SHAPES, **(_SIDEWAYS_SHAPES if sideways else {}), **(_WHEEL_SHAPES if wheels else {})}
     return tuple(
         _make_term(channel, name, text, unit)
         for channel in CHANNELS

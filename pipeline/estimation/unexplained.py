@@ -54,7 +54,9 @@ def search_formula(
     Returns:
         The effects that stay, and the formula; None where none is accepted.
     """
-    terms = list_terms(sideways=sideways)
+    first, *others = search.part.comparisons
+    wheels = not others and first.context.vehicle.kind == "differential"
+    terms = list_terms(sideways=sideways, wheels=wheels)
     final, least, base = outcome.final, find_cost(outcome.final), outcome.final
     wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
     added: list[FormulaEffect] = []

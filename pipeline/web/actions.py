@@ -541,9 +541,11 @@ def keep_floor(session: Session, prepared: PreparedRun, diagnosis: RunDiagnosis 
         prepared: the run.
         diagnosis: of the run; None without one.
     """
-    floor = errors_as_json(prepared.problem.floor)
+    known = None
     if diagnosis is not None:
         paths = {name: one.noise_floor for name, one in diagnosis.by_path.items()}
         known = {**paths, diagnosis.input: diagnosis.noise_floor}.get(prepared.problem.source.value)
-        floor = floor if known is None else dict[str, object](results.to_json(known))
+    floor = (
+        errors_as_json(prepared.problem.floor) if known is None else dict[str, object](results.to_json(known))
+    )
     return session if session.floor == floor else msgspec.structs.replace(session, floor=floor)

@@ -57,8 +57,8 @@ REGIONS = {
 }
 """Regions in words, with their limits."""
 _REPEATS = {
-    "left_angle": "with every turn of the left wheel",
-    "right_angle": "with every turn of the right wheel",
+    "left_angle": "with every turn of the left wheel (where it stands at the start is that of this run)",
+    "right_angle": "with every turn of the right wheel (where it stands at the start is that of this run)",
     "yaw": "with the heading in the map",
 }
 """What the inputs of a formula say of where the error comes from."""

@@ -248,6 +248,12 @@ def test_a_wheel_out_of_round_is_told_by_what_it_has_turned(tmp_path: Path) -> N
     assert run.effects == ()
     assert run.unexplained is not None
     assert "it repeats with every turn of the right wheel" in describe_structure(run.unexplained)
+    # What a formula would leave is not below the floor: there is something left to say.
+    would, floor = run.unexplained.with_formula, run.noise_floor
+    assert would is not None
+    assert floor is not None
+    assert floor.r_mrmse_rad < 1.05 * would.r_mrmse_rad < 0.9 * run.ladder[-1].r_mrmse_rad
+    assert "at the noise floor" not in describe([run]).split("a suggested term")[0]
 
 
 @pytest.mark.long

@@ -32,9 +32,9 @@ def errors_of(pair: Pair) -> Errors:
     return Errors(same, same, position, heading, position, heading, position, heading, 10)
 
 
-@pytest.mark.parametrize("sideways", [False, True])
-def test_no_term_of_a_formula_depends_on_place_or_time(*, sideways: bool) -> None:
-    for term in list_terms(sideways=sideways):
+@pytest.mark.parametrize("more", [False, True])
+def test_no_term_of_a_formula_depends_on_place_or_time(*, more: bool) -> None:
+    for term in list_terms(sideways=more, wheels=more):
         names = {name for one in term().expressions.values() for name in one.names}
         assert not {name.removesuffix("_rate") for name in names} & {"x", "y", "t"}, term.id
 
