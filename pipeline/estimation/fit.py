@@ -1,7 +1,7 @@
 """Maximum likelihood fits of a model to one part of the path: Gauss-Newton on innovations.
 
 The noise is that of the model's own residuals, learned together with its numbers. A cost is in units of
-chi-square: a step that promises less than a hundredth of one is not worth taking.
+chi-square: a step that promises less than a twentieth of one is not worth taking.
 """
 
 from __future__ import annotations

@@ -179,10 +179,10 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     for item in felt:
         texts.append(f"Undecided: {name_group(item.candidates)}")
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
-    smaller = [f"{folded} smaller effect{'s' * (folded > 1)}"] if folded else []
-    smaller += [f"{len(small)} undecided"] if small else []
-    if smaller:
-        texts.append(f"{', and '.join(smaller)} (--all)")
+    counts = [f"{folded} smaller effect{'s' * (folded > 1)}"] if folded else []
+    counts += [f"{len(small)} undecided"] if small else []
+    if counts:
+        texts.append(f"{', and '.join(counts)} (--all)")
     return texts
 
 
