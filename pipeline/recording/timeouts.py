@@ -1,7 +1,8 @@
 """How long a command is held where no other follows: many drives stop by themselves after a time-out.
 
 The time from the last command to half the speed is the time-out and the response time of the drive. That is
-measured where the drive is told to stop, or, if it never is, where it starts.
+measured where the drive is told to stop. If it never is, its dead time is measured where it starts, and how
+slowly it stops in the silences themselves.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import NORMAL_95, Floats, Ints, fit_robustly, robust_spread
+from pipeline.core import CONFIDENCE, Floats, Ints, fit_robustly, robust_spread, student_quantile
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import Motion
@@ -37,6 +38,14 @@ _LATER_S = 0.3
 """Time [s] beyond the longest stop after which a silence must show a stop."""
 _KNOWN = 0.3
 """Largest half-width of the interval, as a fraction of the time-out, that is reported."""
+_QUARTER = 0.25
+"""Part of a change of speed at which its first and its last quarter end."""
+_CURVES = (math.log(2.0) / math.log(3.0), 1.0)
+"""Time of the first half of a change of speed [times of the middle half]: of a first-order lag, of a ramp."""
+_JUMP = 1.5
+"""Time [steps] of the middle half of a jump in `Motion.rates`, which are means over three steps."""
+_FAR = 3.0
+"""Residual [robust spreads] that counts as no more than this: the interval is for the others."""
 _MOST = 400
 """Number of stops that are evaluated: more add no information."""
 
@@ -107,21 +116,38 @@ def find_timeout(reading: Reading, motion: Motion, lever: float) -> CommandTimeo
     run = _Run(reading, motion, lever)
     silences = run.find_silences()
     ordinary = run.find_stops() if silences.size else silences
-    if silences.size and len(ordinary) < _FEWEST:
-        ordinary = run.find_starts()
-    if len(ordinary) < _FEWEST:
+    stands_in = bool(silences.size) and len(ordinary) < _FEWEST
+    if stands_in:
+        # A drive may start faster than it stops, or slower: compare the dead times.
+        ordinary, silences = (one[np.isfinite(one[:, 2])] for one in (run.find_starts(), silences))
+    if min(len(ordinary), len(silences)) < _FEWEST:
         return None
     # The duration of a ramp depends on the speed, that of a lag does not: compare stops at the same speed.
     both: Floats = np.concatenate((ordinary, silences))
     is_silent = np.arange(len(both)) >= len(ordinary)
     design: Floats = np.column_stack((is_silent, np.ones(len(both)), both[:, 1]))
-    (seconds, _, _), rest = fit_robustly(design, both[:, 0])
-    least = run.step / math.sqrt(12.0)
-    share = float(np.linalg.pinv(design.T @ design)[0, 0])
-    half = NORMAL_95 * max(robust_spread(rest), least) * math.sqrt(share)
-    if not half <= _KNOWN * seconds:
+    times = [both[:, 0]]
+    if stands_in:
+        sharp = np.sqrt(np.maximum(both[:, 2] ** 2 - (_JUMP * run.step) ** 2, 0.0))
+        times = [both[:, 0] - curve * middle for curve in _CURVES for middle in (both[:, 2], sharp)]
+    ranges = np.array([_compare(design, one, run.step) for one in times])
+    low, high = float(ranges.min()), float(ranges.max())
+    seconds = 0.5 * (low + high)
+    if not 0.5 * (high - low) <= _KNOWN * seconds:
         return None
-    return CommandTimeout(float(seconds), float(seconds - half), float(seconds + half), len(silences))
+    return CommandTimeout(seconds, low, high, len(silences))
+
+
+def _compare(design: Floats, times: Floats, step: float) -> tuple[float, float]:
+    """The 95 % interval of the first coefficient of times that are known to a step."""
+    (first, *others), rest = fit_robustly(design, times)
+    # A fit to n points passes through as many of them as it has coefficients: these show no spread.
+    shown = np.sort(np.abs(rest))[1 + len(others) :]
+    clipped = np.minimum(shown, _FAR * robust_spread(shown))
+    spread = max(math.sqrt(float(np.mean(clipped**2))), step / math.sqrt(12.0))
+    share = math.sqrt(float(np.linalg.pinv(design.T @ design)[0, 0]))
+    half = student_quantile(CONFIDENCE, float(shown.size)) * spread * share
+    return first - half, first + half
 
 
 class _Run:
@@ -140,9 +166,10 @@ class _Run:
         self.step = float(np.median(np.diff(self.times)))
 
     def find_silences(self) -> Floats:
-        """Times from last commands to half the speed [s], and the speed before, shape (k, 2).
+        """Times from last commands to half the speed [s], that speed, and durations [s], shape (k, 3).
 
-        There are none if they are too few, or the base goes on.
+        A duration is that from three quarters to one quarter of the speed, NaN where it is not known. There
+        are no stops if they are too few, or the base goes on.
         """
         last = np.flatnonzero(self.quiet & self.live[:-1])
         ends = np.minimum(self.stamps[last + 1], self.stamps[last] + _LONGEST_S)
@@ -163,7 +190,7 @@ class _Run:
 
     def _watch_stops(self, last: Ints, starts: Floats, ends: Floats) -> Floats:
         """Times from starts to half the speed, infinite if it is not reached, NaN if they are not known."""
-        halves: Floats = np.full((last.size, 2), np.nan)
+        halves: Floats = np.full((last.size, 3), np.nan)
         for at in range(0, last.size, max(last.size // _MOST, 1)):
             row, start = int(last[at]), float(starts[at])
             if self.stamps[row] - self._follow(row, -1) >= _STEADY_S:
@@ -173,7 +200,7 @@ class _Run:
     def find_starts(self) -> Floats:
         """The same from the first command after a rest on, by the speed that it leads to."""
         first = 1 + np.flatnonzero((self.quiet | (self.size[:-1] == 0.0)) & self.live[1:])
-        halves: Floats = np.full((first.size, 2), np.nan)
+        halves: Floats = np.full((first.size, 3), np.nan)
         for at in range(0, first.size, max(first.size // _MOST, 1)):
             start = float(self.stamps[first[at]])
             until = min(self._follow(int(first[at]), 1), start + _LONGEST_S)
@@ -191,26 +218,36 @@ class _Run:
 
     def _find_half(
         self, start: float, end: float, steady: float, *, rises: bool = False
-    ) -> tuple[float, float]:
-        """Time from a start to half the speed that is steady up to a time, and that speed."""
+    ) -> tuple[float, float, float]:
+        """Time from a start to half the speed that is steady up to a time, that speed, and the duration."""
         edges = np.searchsorted(self.times, (steady - _STEADY_S, steady, start, end))
         first, last, now, stop = edges.tolist()
         held = self.speed[first:last]
         level = float(np.median(held)) if held.size >= _FEWEST else 0.0
         if not now or not level or np.ptp(held) > 2.0 * _ALIKE * level:
-            return math.nan, math.nan
-        times, beyond = self.times[now - 1 : stop], self.speed[now - 1 : stop] / level - 0.5
-        beyond = -beyond if rises else beyond
-        over = np.flatnonzero(beyond < 0.0)
+            return math.nan, math.nan, math.nan
+        times, part = self.times[now - 1 : stop], self.speed[now - 1 : stop] / level
+        done = part if rises else 1.0 - part
+        over = np.flatnonzero(done > 0.5)  # noqa: PLR2004 - half
         reached = int(over[0]) if over.size else times.size
-        seen = np.append(times, end)[: reached + 1]
-        if not reached or (np.diff(seen) > _HOLE * self.step).any():
-            return math.nan, math.nan
+        is_hole = np.diff(np.append(times, end)) > _HOLE * self.step
+        if not reached or is_hole[:reached].any():
+            return math.nan, math.nan, math.nan
         if not over.size:
-            return math.inf, level
-        before, after = times[reached - 1], times[reached]
-        share = beyond[reached - 1] / (beyond[reached - 1] - beyond[reached])
-        return float(before + share * (after - before) - start), level
+            return math.inf, level, math.nan
+        half = _cross(times, done, reached, 0.5)
+        before = np.flatnonzero(done[:reached] <= _QUARTER)
+        after = np.flatnonzero(done > 1.0 - _QUARTER)
+        if not before.size or not after.size or is_hole[: after[0]].any():
+            return half - start, level, math.nan
+        begins = _cross(times, done, int(before[-1]) + 1, _QUARTER)
+        return half - start, level, _cross(times, done, int(after[0]), 1.0 - _QUARTER) - begins
+
+
+def _cross(times: Floats, values: Floats, row: int, value: float) -> float:
+    """Time at which values that exceed one from this row on reach it."""
+    share = (value - values[row - 1]) / (values[row] - values[row - 1])
+    return float(times[row - 1] + share * (times[row] - times[row - 1]))
 
 
 def _find_period(reading: Reading) -> float:
