@@ -22,6 +22,4 @@ MISSES = {
     "tests/estimation/test_joint_clocks.py::"
     "test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it[the command alone]":
         "the clock of one of three runs lies 2.5 standard errors off: .0580 for .06 s",
-    "tests/docs/test_measured.py::test_no_headline_is_older_than_the_program_by_more_than_a_version[paper]":
-        "the figures of the paper were measured before the stages became four: make measure ARGS=paper",
 }  # fmt: skip

@@ -177,7 +177,8 @@ class Search:
         while other is not None:
             # Models are compared with all that improves them, what is not accepted in the end included.
             before, given = find_cost(extended), self.given
-            self.given = asked.union(one.id for one in self._list_small(other, other.ids))
+            small = {one.id for one in other.state.effects if is_too_small(one, self.conditions)}
+            self.given = asked | small
             extended, refused = self._extend_all(other)
             if self.budget.is_spent() or not find_cost(extended) < before - EQUAL:
                 self.given = given
@@ -228,8 +229,6 @@ class Search:
                 better = self._exchange(current)
             if better is None or not find_cost(better) < find_cost(current):
                 break
-            new = set(better.ids) - set(current.ids)
-            self.given = self.given.union(effect.id for effect in self._list_small(better, new))
             current = better
         return current, refused
 
@@ -264,16 +263,7 @@ class Search:
 
     def _is_unnamed(self, judged: Judged) -> bool:
         """Whether a model was refused for the size of its new effects alone."""
-        return bool(judged.added) and len(self._list_small(judged.fit, judged.added)) == len(judged.added)
-
-    def _list_small(self, fit: PartFit, names: Collection[str]) -> list[Effect]:
-        """Those of some effects that are too small for a name in every run."""
-        return [
-            effect
-            for effect in fit.state.effects
-            if effect.id in names
-            and all(is_too_small(one, self.conditions) for one in _list_acting(fit, effect))
-        ]
+        return bool(judged.new) and all(is_too_small(effect, self.conditions) for effect in judged.new)
 
     def fit(self, state: State, noise: Noise | None = None) -> PartFit:
         """The fit from a state; made once."""
@@ -328,11 +318,7 @@ class Search:
             fit = self._reduce(self.fit(start.state, start.noise), base)
             if set(fit.ids) == set(base.ids):
                 continue
-            new = set(fit.ids) - set(base.ids)
-            small = self._list_small(fit, new)
-            # What is too small for a name is no evidence for or against the other that it comes with.
-            beside = base if len(small) == len(new) else self.fit(base.state.add(*small))
-            one = self._judge(beside, fit, is_final=False)
+            one = self._judge(base, fit, is_final=False)
             if fit.ids not in judged or one.cost < judged[fit.ids].cost:
                 judged[fit.ids] = one
             if not one.refusal:
@@ -548,21 +534,16 @@ def judge(
     return Judged(base, fit, added, refusal, gain, frequency, by_unit, falls)
 
 
-def _list_acting(fit: PartFit, effect: Effect) -> list[Effect]:
-    """An effect as it acts in each run."""
+def _refuse_numbers(
+    base: PartFit, fit: PartFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
+) -> str:
+    """Why an effect's numbers do not allow a name, empty where they do; see `judge`."""
     acting = fit.state.list_as_it_acts(effect)
     if len(acting) > 1 and effect.late is not None:
         # Clocks of several runs are told by their differences: what they have in common may be a delay.
         delays = [one.delay for one in acting]
         acting.append(effect.of_delay(min(delays) - max(delays)))
-    return acting
-
-
-def _refuse_numbers(
-    base: PartFit, fit: PartFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
-) -> str:
-    """Why an effect's numbers do not allow a name, empty where they do; see `judge`."""
-    if not any(is_nameable(one, conditions) for one in _list_acting(fit, effect)):
+    if not any(is_nameable(one, conditions) for one in acting):
         return "its values are not possible"
     t = measure_t(fit, effect, base)
     if t < least_t:

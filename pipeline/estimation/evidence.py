@@ -11,6 +11,9 @@ _ROUNDS = 200
 _CONVERGED = 1e-4
 """Relative change of both precisions below which the evidence has converged."""
 
+_LEAST = 1e-10
+"""Square of a direction's size in the inputs, over that of the largest one, below which no row has it."""
+
 
 def regress(inputs: Floats, target: Floats, independent: float = 1.0) -> Floats:
     """Coefficients of Bayesian linear regression (MacKay, Neural Computation 4, 1992), shape (p,).
@@ -23,7 +26,9 @@ def regress(inputs: Floats, target: Floats, independent: float = 1.0) -> Floats:
     normal, pull = (independent * product for product in (np.asarray(inputs.T @ inputs), inputs.T @ target))
     square, count = independent * float(target @ target), independent * target.size
     sizes, turn = np.linalg.eigh(normal)
-    sizes, turned = np.maximum(sizes, 0.0), turn.T @ pull
+    # Directions that no row has differ from zero by rounding.
+    sizes = np.where(sizes > _LEAST * sizes.max(initial=0.0), sizes, 0.0)
+    turned = np.where(sizes > 0.0, turn.T @ pull, 0.0)
     weight, noise = 1.0, count / max(square, 1e-12)
     mean = np.zeros(sizes.size)
     if not sizes.any():

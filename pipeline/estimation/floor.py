@@ -85,8 +85,8 @@ def _explain_all(part: Part, residual: Floats) -> Floats:
             same = np.zeros((*residual.shape, inputs.shape[1]))
             same[:, known] = inputs
             columns = noise.whiten(same, part.steps, weights)[:, known]
-            for run in range(len(part.comparisons)):
-                mine = part.run == run
+            for group in part.grounds:
+                mine = np.isin(part.run, group) if group else np.ones(part.run.size, dtype=bool)
                 size = np.sqrt((columns[mine] ** 2).mean(axis=0))
                 live = np.flatnonzero(size > 0.0)
                 numbers = regress(columns[mine][:, live] / size[live], (weights * target)[mine, known])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import pytest
@@ -60,3 +61,19 @@ def test_the_floor_of_a_model_that_lacks_an_effect_is_that_of_the_true_one(drawn
     floor, errors = _judge(_DRAWN[drawn], seed, ["effective_track", "drive_lag"], 90.0)
     assert floor.t_mrmse_m == pytest.approx(true.t_mrmse_m, rel=0.25)
     assert floor.t_mrmse_m < 0.9 * errors.t_mrmse_m
+
+
+def test_trials_of_seconds_have_a_floor_together() -> None:
+    """A regression of each alone has more inputs than steps: it had no number for one of the channels."""
+    runs = [
+        simulate(
+            TRUTH, seed=seed, duration_s=8.0, program=Program("teleop"), disturbance=Disturbance(0.03, 0.05)
+        )
+        for seed in range(4)
+    ]
+    model = Model(HUSKY, tuple(find_effect(name)() for name in TRUTH))
+    judged = judge_model(Problem(runs, HUSKY, Input.COMMAND), model)
+    assert all(math.isfinite(value) for value in (*judged.floor.velocity_rms, *judged.floor.velocity_spread))
+    assert 0.5 * judged.whole.errors.t_mrmse_m < judged.floor.t_mrmse_m < judged.whole.errors.t_mrmse_m
+    # Half a minute of turning tells noise from what the input does within a factor of three.
+    assert 0.3 * judged.whole.errors.r_mrmse_rad < judged.floor.r_mrmse_rad < judged.whole.errors.r_mrmse_rad
