@@ -27,7 +27,7 @@ _ROUNDS = 2
 """Times that the noise is learned: of what a model leaves, and of what the regression leaves of that."""
 
 
-def estimate_floor(problem: Problem, state: State) -> Errors:
+def estimate_floor(problem: Problem, state: State | None = None) -> Errors:
     """The errors of a model that explains everything but noise and random motion.
 
     A regression on the input of the last two seconds, the attitude, the heading and turned wheels
@@ -37,9 +37,9 @@ def estimate_floor(problem: Problem, state: State) -> Errors:
 
     Args:
         problem: the runs.
-        state: a model with its values.
+        state: a model with its values; by default the ideal model.
     """
-    part = problem.parts[0]
+    part, state = problem.parts[0], state or problem.start_state()
     residual = part.find_residuals(state)
     before, after = (_measure(part, one) for one in (residual, _explain_all(part, residual)))
     errors = score(problem if len(problem.parts) == 1 else problem.behind_wheels, state).pooled

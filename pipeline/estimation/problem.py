@@ -10,9 +10,7 @@ import numpy as np
 
 from pipeline.core import Flags, Floats, Newest, require_compiler
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
-from pipeline.estimation.errors import Errors
 from pipeline.estimation.fit import PartFit
-from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Fold, find_near, make_folds
 from pipeline.estimation.largest import measure_exceeded, measure_largest
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
@@ -141,7 +139,7 @@ class Problem:
     def with_parts(self, parts: tuple[Part, ...]) -> Problem:
         """The same runs with other parts, without cached results of the former ones."""
         problem = copy(self)
-        for name in ("behind_wheels", "floor", "whole", "folds", "training"):
+        for name in ("behind_wheels", "whole", "folds", "training"):
             problem.__dict__.pop(name, None)
         problem.parts = parts
         return problem
@@ -155,11 +153,6 @@ class Problem:
     def names(self) -> tuple[str, ...]:
         """Names of the runs."""
         return tuple(run.name for run in self.runs)
-
-    @cached_property
-    def floor(self) -> Errors:
-        """The noise floor of these runs by what the ideal model leaves, see `estimate_floor`."""
-        return estimate_floor(self, self.start_state())
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:

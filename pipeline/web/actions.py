@@ -31,6 +31,7 @@ from pipeline.estimation.apportion import apportion, find_half
 from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.errors import errors_as_json
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
@@ -545,7 +546,7 @@ def keep_floor(session: Session, prepared: PreparedRun, diagnosis: RunDiagnosis 
     if diagnosis is not None:
         paths = {name: one.noise_floor for name, one in diagnosis.by_path.items()}
         known = {**paths, diagnosis.input: diagnosis.noise_floor}.get(prepared.problem.source.value)
-    floor = (
-        errors_as_json(prepared.problem.floor) if known is None else dict[str, object](results.to_json(known))
+    floor: dict[str, object] = dict(
+        errors_as_json(estimate_floor(prepared.problem)) if known is None else results.to_json(known)
     )
     return session if session.floor == floor else msgspec.structs.replace(session, floor=floor)

@@ -57,11 +57,10 @@ def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: p
     """The floor is zero where hardly any windows can be compared: no sentence divides by it."""
     manifest = analyze_log(SAMPLE, Options(out=tmp_path / "results", report=False)).manifest
     vehicle, recording = read_recording(manifest)
-    for room in ("problem", "ladder"):
-        monkeypatch.setattr(
-            f"pipeline.estimation.{room}.estimate_floor",
-            lambda *given: replace(estimate_floor(*given), t_mrmse_m=0.0, r_mrmse_rad=0.0),
-        )
+    monkeypatch.setattr(
+        "pipeline.estimation.ladder.estimate_floor",
+        lambda *given: replace(estimate_floor(*given), t_mrmse_m=0.0, r_mrmse_rad=0.0),
+    )
     monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
     diagnosis = diagnose_runs([recording], vehicle)
     (run,) = diagnosis.runs

@@ -11,6 +11,7 @@ from game.true_model import build_true
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, find_effect
@@ -34,7 +35,7 @@ def _compare(category: str, seed: int, folder: Path) -> np.ndarray:
     problem = Problem([run], vehicle, Input.COMMAND)
     true = build_true(riddle.answer, run.duration_s)
     left = hold_out(problem, fit_model(problem, Model(problem.vehicle, true))).pooled
-    return np.array(problem.floor.ratios(left))
+    return np.array(estimate_floor(problem).ratios(left))
 
 
 @pytest.mark.long

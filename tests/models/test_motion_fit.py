@@ -16,6 +16,7 @@ from pipeline.estimation import (
     predict_from,
     score,
 )
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import GAP_S
 from pipeline.estimation.held_out import measure_by_terrain
 from pipeline.estimation.ladder import judge_model, judge_whole
@@ -190,7 +191,7 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
         ),
     )
     true = score(problem, problem.start_state(true_model.effects)).pooled
-    x, y, _, position, _ = problem.floor.ratios(true)
+    x, y, _, position, _ = estimate_floor(problem).ratios(true)
     assert np.allclose((x, y, position), 1.0, atol=0.15)
 
 
@@ -211,7 +212,7 @@ def test_the_floor_is_nearly_the_same_whatever_the_model_lacks() -> None:
     floors = []
     for truth in ({}, {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}):
         run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance(0.03, 0.05))
-        floors.append(Problem([run], HUSKY, Input.MEASURED).floor)
+        floors.append(estimate_floor(Problem([run], HUSKY, Input.MEASURED)))
     assert np.allclose(floors[0].ratios(floors[1]), 1.0, atol=0.2)
     judged = judge_model(Problem([run], HUSKY, Input.MEASURED), model_of("effective_track", "icr_offset"))
     assert np.allclose(judged.floor.ratios(floors[1]), 1.0, atol=0.2)

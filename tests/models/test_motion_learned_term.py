@@ -13,6 +13,7 @@ from verbs import run_verb
 
 from pipeline.estimation import Comparison, Fitted, HeldOut, Input, Problem, fit_model, hold_out
 from pipeline.estimation.across_runs import Ratios, make_bands, measure_coverage
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.learned_step import (
     ResidualData,
@@ -70,7 +71,7 @@ def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(problem
     assert rung.refusal == ""
     assert rung.held_out.pooled.t_mrmse_m < 0.7 * below.pooled.t_mrmse_m
     ideal = hold_out(problem, fit_model(problem, Model(HUSKY), exact=True)).pooled
-    shares = rung.share_removed(ideal, problem.floor)
+    shares = rung.share_removed(ideal, estimate_floor(problem))
     for share in shares.values():
         assert share is not None
         assert share[0] < share[1] + 0.02
