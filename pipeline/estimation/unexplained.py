@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pipeline.core import Floats
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.fit import PartFit
-    from pipeline.estimation.ladder import Judgement
+    from pipeline.estimation.ladder import Judgement, LadderStep
     from pipeline.estimation.learned_step import LearnedStep
     from pipeline.models import FormulaEffect
 
@@ -117,9 +117,11 @@ def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) ->
         channel = CHANNELS[int(np.argmax(falls))][-1]
         fitted = step.fitted.model.effect(formula.id)
         channels = tuple(name[-1] for name, fall in zip(CHANNELS, falls.tolist(), strict=True) if fall > 0.0)
-        said = step
+        said: LadderStep | None = step
         if leading is not judgement:
             said = judge_whole(leading.problem, leading.fitted.model + formula)
+            # What the wheels show may be too little from commands to promise anything of them.
+            said = said if lowers_errors(leading.whole.errors, said.errors) else None
         return Unexplained(
             "formula",
             float(falls.max()),
@@ -127,7 +129,7 @@ def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) ->
             channels or (channel,),
             judgement.problem.source.value,
             formula=format_effect(fitted),
-            with_formula=read_result(errors_as_json(said.errors), Errors),
+            with_formula=None if said is None else read_result(errors_as_json(said.errors), Errors),
         )
     return None
 
