@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import FOLDS
-from pipeline.estimation.noise import CLIP, huber_cost
+from pipeline.estimation.noise import find_weights, huber_cost
 from pipeline.estimation.state import combine_columns, flatten, pick_columns
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class PartFit:
 def whiten(part: Part, noise: Noise, residual: Floats, columns: Floats) -> White:
     """Weighted innovations of a residual (n, 3) and of columns (n, 3, p)."""
     made = noise.whiten(residual[:, :, None], part.steps)
-    weights: Floats = np.sqrt(part.weight * (CLIP / np.maximum(np.abs(made[:, :, 0]), CLIP)))
+    weights: Floats = np.sqrt(part.weight * find_weights(made[:, :, 0]))
     flat = _line_up(made * weights[:, :, None], noise)[:, 0]
     rows = np.repeat(np.arange(residual.shape[0]), len(noise.known))
     return White(flat, _line_up(noise.whiten(columns, part.steps, weights), noise), rows, weights)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from pipeline.core import Floats, robust_spreads
 from pipeline.estimation.evidence import regress
 from pipeline.estimation.held_out import score
-from pipeline.estimation.noise import CLIP
+from pipeline.estimation.noise import find_weights
 from pipeline.estimation.parts import HORIZONS_S
 from pipeline.estimation.window_residuals import average_lags, locate_windows, make_features
 from pipeline.models import Timing
@@ -76,21 +77,20 @@ def _measure(part: Part, residual: Floats) -> dict[str, Floats]:
 def _explain_all(part: Part, residual: Floats) -> Floats:
     """What a regression on the input's past, the attitude and turned wheels leaves of increments (n, 3)."""
     inputs = np.concatenate([_list_inputs(part, *one) for one in enumerate(part.comparisons)])
+    alike = np.broadcast_to(inputs[:, None, :], (*residual.shape, inputs.shape[1]))
+    grounds = [np.flatnonzero(np.isin(part.run, group) if group else part.run >= 0) for group in part.grounds]
     rest = np.array(residual)
     for _ in range(_ROUNDS):
         noise = part.learn(rest)
         target = noise.whiten(residual[:, :, None], part.steps)[:, :, 0]
-        weights = np.sqrt(CLIP / np.maximum(np.abs(target), CLIP))
-        for known in noise.known:
-            same = np.zeros((*residual.shape, inputs.shape[1]))
-            same[:, known] = inputs
-            columns = noise.whiten(same, part.steps, weights)[:, known]
-            for group in part.grounds:
-                mine = np.isin(part.run, group) if group else np.ones(part.run.size, dtype=bool)
-                size = np.sqrt((columns[mine] ** 2).mean(axis=0))
-                live = np.flatnonzero(size > 0.0)
-                numbers = regress(columns[mine][:, live] / size[live], (weights * target)[mine, known])
-                rest[mine, known] = residual[mine, known] - inputs[mine][:, live] @ (numbers / size[live])
+        weights = np.sqrt(find_weights(target))
+        columns, target = noise.whiten(alike, part.steps, weights), weights * target
+        for rows, known in product(grounds, noise.known):
+            own = columns[rows, known]
+            size = np.sqrt((own**2).mean(axis=0))
+            live = np.flatnonzero(size > 0.0)
+            numbers = regress(own[:, live] / size[live], target[rows, known])
+            rest[rows, known] = residual[rows, known] - inputs[rows][:, live] @ (numbers / size[live])
     return rest
 
 

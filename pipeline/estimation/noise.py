@@ -217,6 +217,11 @@ def huber_cost(innovations: Floats) -> Floats:
     return cost
 
 
+def find_weights(innovations: Floats) -> Floats:
+    """Huber's weights, by which squares have the slope of `huber_cost`; of the shape of the argument."""
+    return np.asarray(CLIP / np.maximum(np.abs(innovations), CLIP))
+
+
 def _maximize(
     values: Floats, steps: Steps, step_s: float, known: tuple[float, float] | None, *, exact: bool
 ) -> tuple[float, float]:

@@ -81,7 +81,7 @@ _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
 """Detection limits that are listed, the smallest ones."""
 _VALUE = re.compile(r'^(\w+) = \{ value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
-_IDEAL = {
+_INPUTS = {
     "v0": "ideal forward speed",
     "s0": "ideal lateral speed",
     "w0": "ideal yaw rate",
@@ -395,12 +395,12 @@ def _list_formula(text: str) -> Iterator[str]:
     """Each term of a formula as model files have it, with its numbers, and its inputs in words."""
     numbers = [(name, f"{float(value):.3g} {unit}") for name, value, unit in _VALUE.findall(text)]
     for line in text.splitlines():
-        text = line.replace('"', "")
-        if line.startswith("v_") and len(text) <= _LONGEST_TERM:
-            names = set(re.findall(r"\w+", line))
+        term = line.replace('"', "")
+        if term.startswith("v_") and len(term) <= _LONGEST_TERM:
+            names = set(re.findall(r"\w+", term))
             known = [f"{name} = {value.removesuffix(' 1')}" for name, value in numbers if name in names]
-            known += [f"{name} the {words}" for name, words in _IDEAL.items() if name in names]
-            yield ", ".join([text, *known])
+            known += [f"{name} the {words}" for name, words in _INPUTS.items() if name in names]
+            yield ", ".join([term, *known])
 
 
 def format_suggestion(rest: Unexplained, verdict: str = "") -> str:

@@ -189,7 +189,7 @@ def describe_structure(rest: Unexplained) -> str:
         names = set(re.findall(r"\w+", rest.formula or ""))
         repeats = [words for name, words in _REPEATS.items() if name in names]
         text = f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
-        return ": ".join([text, *([f"it repeats {enumerate_texts(repeats)}"] if repeats else [])])
+        return f"{text}: it repeats {enumerate_texts(repeats)}" if repeats else text
     if rest.kind == "learned":
         matters = (
             f"; {rest.of} matters {rest.times:.0f} times as much as any other"
