@@ -1,7 +1,5 @@
 """One log while it is examined: how its signals are read, and what was corrected so far."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ Commands and wheels are ideal velocities of the body. The wheels follow the comm
 that are fitted; what remains is a factor, which is that of slow driving: there the drive does not saturate.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

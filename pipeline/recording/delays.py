@@ -1,7 +1,5 @@
 """When a command acts: never before it is sent, and how late."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 What the wheels do with the command is observable without a pose; what the ground does is not.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Encoders of the wheels: dead, backward, dying, or on another scale, each read anew as corrected."""
 
-from __future__ import annotations
-
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.motion import Motion
 from pipeline.recording.outages import leave_out

@@ -5,8 +5,6 @@ another is as likely. The pose gives increments of the body; every other signal 
 gains and a free delay; names and types are priors in the same unit (nats).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Examination of a log: from the columns of its candidates to a `Recording`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

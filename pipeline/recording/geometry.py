@@ -3,8 +3,6 @@
 They come last: no decision on roles, signs and frames needs them, and what is not excited is missing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

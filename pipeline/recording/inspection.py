@@ -1,7 +1,5 @@
 """Health of a log: timing of its topics, losses, and the topics that an analysis would use."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

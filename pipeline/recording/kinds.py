@@ -1,7 +1,5 @@
 """Kind of the vehicle that the signals show: a car, wheels with rollers, or joints that steer otherwise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Set-up of one log: its configuration, vehicle and topics, and what it lacks for an analysis."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A body on wheels moves along its own axis, but for a slide outward in turns. Wha
 motion ahead where the frame of the poses is turned, and with the turning where they are of another point.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ hypothesis holds until the gain in likelihood of another one is worth a change. 
 moves as commanded, so that only the encoder can be wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Roles of signals: which of the candidates are the command and the wheels."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

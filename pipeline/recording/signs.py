@@ -1,7 +1,5 @@
 """Frame of the poses and signs of the other signals: what turns, and what goes the other way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from pipeline.core import enumerate_texts

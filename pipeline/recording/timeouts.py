@@ -5,8 +5,6 @@ measured where the drive is told to stop. If it never is, its dead time is measu
 slowly it stops in the silences themselves.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Units of the signals by the motion, corrected or told."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Numbers that may be the wheels or the command of a log, of types that do not say so: how to use them."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Collection, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Page of a run: its sections (why and health: `sections_why`), its figures, also as files."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import statistics
