@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 from pipeline.core import INPUTS, SlipError
 
 if TYPE_CHECKING:
-    from pipeline.recording.drive_alone import examine_drive
-    from pipeline.recording.examination import Recording, examine
+    from pipeline.recording.examination import Recording, examine, examine_drive
 
 __all__ = [
     "FAULTS",
@@ -64,6 +63,6 @@ def __getattr__(name: str) -> object:
     # The verdict on a stored run needs the names of faults only.
     if name not in __all__:
         raise AttributeError(name)
-    from pipeline.recording import drive_alone, examination  # noqa: PLC0415
+    from pipeline.recording import examination  # noqa: PLC0415
 
-    return getattr(drive_alone if name == "examine_drive" else examination, name)
+    return getattr(examination, name)

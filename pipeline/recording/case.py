@@ -9,9 +9,8 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError
 from pipeline.recording.evidence import RATES, RIMS, SPEEDS, WHEELS, Axis, Units
-from pipeline.recording.motion import Motion
+from pipeline.recording.motion import CLEAR, Motion
 from pipeline.recording.readings import Bent, Explained, Held, Reading
-from pipeline.recording.score import CLEAR
 from pipeline.sources import (
     CONFIGURED,
     Configuration,

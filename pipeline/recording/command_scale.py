@@ -13,8 +13,8 @@ import polars as pl
 from pipeline.core import Flags, Floats, SlipError, fit_robustly, robust_spread
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.motion import FEWEST_STEPS
 from pipeline.recording.readings import Held, Reading
-from pipeline.recording.score import FEWEST_STEPS
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import Vehicle, list_presets
 from pipeline.stages import ONE_SCALE, Finding

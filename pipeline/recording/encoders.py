@@ -1,12 +1,201 @@
 """Encoders of the wheels: dead, backward, dying, or on another scale, each read anew as corrected."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core import Floats, enumerate_texts
 from pipeline.recording.case import Candidate, Case, is_crossed
-from pipeline.recording.motion import Motion
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, fit, measure_share
 from pipeline.recording.outages import leave_out
-from pipeline.recording.readings import SIDES
-from pipeline.recording.wheel_scales import settle_joints, settle_scales
-from pipeline.sources import DriveSection
-from pipeline.stages import Finding
+from pipeline.recording.readings import SIDES, Held
+from pipeline.sources import DriveForm, DriveSection
+from pipeline.stages import Finding, choose_sides
+
+_FOLLOWS = 0.5
+"""Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""
+_SAME = 1.25
+"""Ratio of two wheels' scales up to which tyres, loads and the ground may make it."""
+_AGREE = 1.5
+"""Ratio within which driving and turning show the same scale: on grass the sides of a Warthog turn it by 1.26
+of each other."""
+_EDGES = (2.0, 4.0)
+"""Counts of a pulse by decoders that look at two or four of its edges, over those of one."""
+_IDLE = 0.1
+"""Turning over that of the others below which a wheel's encoder is not turned by the drive."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How a wheel turns with the motion.
+
+    Attributes:
+        gains: per metre ahead and per radian of the heading, shape (2,) [rad/m, 1].
+        t: their ratios to standard errors.
+        follows: whether the motion explains it.
+        path: how far it turns over how far the motion says.
+    """
+
+    gains: Floats
+    t: Floats
+    follows: bool
+    path: float = 1.0
+
+
+def _is_alike(one: float, other: float) -> bool:
+    """Whether the motion explains as much of the path of two wheels.
+
+    Noise of the poses attenuates how much a wheel turns with the motion, in one more than in another.
+    """
+    return bool(abs(np.log(one / other)) < np.log(_AGREE))
+
+
+def measure_wheel(wheel: Held, motion: Motion, late: tuple[float, float], beside: Sequence[Held]) -> Turning:
+    """How a wheel turns with the motion.
+
+    Args:
+        wheel: its speed.
+        motion: of the body.
+        late: lag and delay of the motion after the wheels [s].
+        beside: signals that are recorded throughout the steps that count, too.
+    """
+    nothing = Turning(np.zeros(2), np.zeros(2), follows=False)
+    if wheel.is_constant:
+        return nothing
+    keep = np.logical_and.reduce([one.is_there(motion.steps) for one in (wheel, *beside)])
+    if keep.sum() < FEWEST_STEPS:
+        return nothing
+    part = motion.take(keep)
+    turned = wheel.integrate(part.steps, *late)
+    columns = np.column_stack([part.body.real, part.yaw, part.body.imag])
+    made = fit(turned, columns, part.steps)
+    share = measure_share(turned, columns @ made.gains)
+    path = float(np.abs(turned).sum() / max(np.abs(columns @ made.gains).sum(), 1e-9))
+    return Turning(made.gains[:2], made.t[:2], share > _FOLLOWS and abs(made.t[0]) > CLEAR, path)
+
+
+def find_odd_joints(
+    joints: Mapping[str, Turning], sides: Mapping[str, str]
+) -> tuple[dict[str, float], list[str]]:
+    """Wheels that contradict all the others.
+
+    Args:
+        joints: by name.
+        sides: side of each of them.
+
+    Returns:
+        Factors by name of those that count backward or on another scale, and names of those that are not
+        turned by the drive, though others of their side are.
+    """
+    fine = [one for one in joints.values() if one.follows]
+    # Two wheels that differ do not tell which one is right.
+    if len(fine) < 3:  # noqa: PLR2004
+        return {}, []
+    usual, path = (
+        float(np.median(some)) for some in ([one.gains[0] for one in fine], [one.path for one in fine])
+    )
+    factors, idle = {}, []
+    for name, one in joints.items():
+        ratio = float(one.gains[0]) / usual if usual else 0.0
+        others = [other for key, other in joints.items() if key != name and sides[key] == sides[name]]
+        is_scaled = ratio != 0.0 and abs(np.log(abs(ratio))) > np.log(_SAME)
+        is_scaled = is_scaled and _is_alike(one.path, path)
+        if one.follows and (ratio < 0.0 or is_scaled):
+            size = snap(abs(ratio)) if is_scaled else 1.0
+            factors[name] = float(np.sign(ratio)) / size
+        elif not one.follows and abs(ratio) < _IDLE and any(other.follows for other in others):
+            idle.append(name)
+    # More than half of them that differ are a vehicle of another kind.
+    return (factors, idle) if 2 * len(factors) < len(joints) else ({}, idle)
+
+
+def compare_sides(left: Turning, right: Turning) -> float | None:
+    """Scale of the left side's encoder over the right one's; None if it is the same, or not clear."""
+    if not (left.follows and right.follows):
+        return None
+    of_speed, of_turn = (float(one / other) for one, other in zip(left.gains, right.gains, strict=True))
+    # Laps of one radius do not tell what drives from what turns.
+    error = np.hypot(1.0 / left.t[0], 1.0 / right.t[0])
+    if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME) + CLEAR * error:
+        return None
+    if not _is_alike(left.path, right.path):
+        return None
+    turns = min(abs(left.t[1]), abs(right.t[1])) > CLEAR
+    # A body that turns by something else than its wheels shows two scales.
+    if turns and (of_turn >= 0.0 or abs(np.log(-of_turn / of_speed)) > np.log(_AGREE)):
+        return None
+    return snap(of_speed)
+
+
+def snap(scale: float) -> float:
+    """A scale above zero, or the ratio of decoders that it is near to: what remains may be the ground's."""
+    ratios = [ratio for edge in _EDGES for ratio in (edge, 1.0 / edge)]
+    return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
+
+
+def settle_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
+    """Correct single wheels that contradict all others of a topic of joints; whether there are any."""
+    section, reading = case.complete().wheels, wheels.reading
+    is_free = section.factors is None and section.left is None and section.right is None
+    if wheels.source.form is not DriveForm.JOINTS or reading.form != "sides" or not is_free:
+        return False
+    times, rates = case.extraction.read_rates(wheels.source)
+    chosen = choose_sides(sorted(rates), section)
+    sides = {joint: side for side, joints in chosen.items() for joint in joints}
+    late = (0.0, 0.0) if reading.explained is None else (reading.explained.lag, reading.explained.delay)
+    turning = {
+        joint: measure_wheel(Held(times, rates[joint]), motion, late, reading.inputs)
+        for joint in sorted(sides)
+    }
+    factors, idle = find_odd_joints(turning, sides)
+    factors = {joint: float(f"{factor:.4g}") for joint, factor in factors.items()}
+    for joint, factor in factors.items():
+        how = "counts backward" if factor < 0.0 else "counts"
+        if abs(factor) != 1.0:
+            how += f" {1.0 / abs(factor):.3g} times as fast as"
+        else:
+            how += " against"
+        what = f"{joint} of {wheels.source} {how} the other wheels"
+        line = ", ".join(f'"{name}" = {value:g}' for name, value in factors.items())
+        case.correct("wheels", what, f"factors = {{{line}}}", {"factors": factors})
+    for side, joints in chosen.items():
+        left = [joint for joint in joints if joint not in idle]
+        if left == joints or case.moves_sideways:
+            continue
+        lost = enumerate_texts([joint for joint in joints if joint in idle])
+        named = ", ".join(f'"{joint}"' for joint in left)
+        line = f"{side} = [{named}]"
+        what = f"the drive does not turn {lost} of {wheels.source}, as it does the other wheels of its side"
+        case.correct("wheels", what, line, {side: left})
+    return bool(factors or idle)
+
+
+def settle_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
+    """Correct a side whose encoder counts on another scale than the other; whether one does."""
+    reading, made = wheels.reading, wheels.reading.explained
+    first, second = reading.first, reading.second
+    is_free = case.complete().wheels.factors is None
+    if reading.form != "sides" or first is None or second is None or made is None or not is_free:
+        return False
+    late = (made.lag, made.delay)
+    left, right = (measure_wheel(one, motion, late, (first, second)) for one in (first, second))
+    scale = compare_sides(left, right)
+    if scale is None:
+        return False
+    counts = {"left": abs(float(left.gains[0])), "right": abs(float(right.gains[0]))}
+    side, other = ("left", "right") if scale > 1.0 else ("right", "left")
+    if case.is_known:
+        # What does not explain all of a wheel's turning makes both seem low.
+        high, low = (abs(np.log(counts[one] * case.vehicle.wheel_radius_m)) for one in (side, other))
+        side, other = (other, side) if low - high > 0.5 * abs(np.log(scale)) else (side, other)
+    factor = float(f"{1.0 / snap(counts[side] / counts[other]):.4g}")
+    what = (
+        f"the {side} wheels' encoder counts {1.0 / factor:.3g} times as much as the {other} one for "
+        "the same motion (another gear or resolution?)"
+    )
+    case.correct("wheels", what, f"factors = {{{side} = {factor:g}}}", {"factors": {side: factor}})
+    return True
 
 
 def settle_wheels(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> bool:

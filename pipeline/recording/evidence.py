@@ -14,9 +14,8 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core import Complex, Floats, join_parts
-from pipeline.recording.motion import Motion
+from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare, fit
 from pipeline.recording.readings import Reading, fit_across
-from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
 from pipeline.sources import COMMANDED, LENGTH_UNITS, MEASURED, convert_unit
 
 # Frame of the pose.

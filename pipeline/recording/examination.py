@@ -1,32 +1,41 @@
-"""Examination of a log: from the columns of its candidates to a `Recording`."""
+"""Examination of a log: from the columns of its candidates to a `Recording`, with poses and without."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from pipeline.core import SlipError
-from pipeline.recording.case import Case
+import numpy as np
+
+from pipeline.core import SlipError, enumerate_texts
+from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.command_scale import measure_command
-from pipeline.recording.delays import settle_delay
-from pipeline.recording.encoders import settle_wheels
+from pipeline.recording.encoders import report_dead, settle_wheels
 from pipeline.recording.evidence import equal_motion
-from pipeline.recording.geometry import Geometry, explain_wheels, measure_lengths
-from pipeline.recording.kinds import find_kind, leave_out_steered, report_turn
-from pipeline.recording.motion import measure_motion
-from pipeline.recording.mounting import report_mounting
+from pipeline.recording.geometry import Geometry, Length, explain_wheels, measure_lengths, roll_wheels
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, measure_motion
+from pipeline.recording.outages import leave_out
 from pipeline.recording.readings import Reading
 from pipeline.recording.roles import (
     choose_roles,
+    find_kind,
     leave_out_of_ground,
+    leave_out_steered,
     name_sources,
     read_drives,
+    report_turn,
     settle_stamps,
 )
-from pipeline.recording.score import CLEAR, FEWEST_STEPS
-from pipeline.recording.signs import report_signs, turn_motion
-from pipeline.recording.timeouts import settle_timeout
-from pipeline.recording.units import find_units, settle_gyro, settle_lengths
-from pipeline.run import Alignment
-from pipeline.sources import Configuration, Sources
+from pipeline.recording.signs import report_mounting, report_signs, turn_motion
+from pipeline.recording.timeouts import settle_delay, settle_timeout
+from pipeline.recording.units import correct_wheel_unit, find_units, settle_gyro, settle_lengths
+from pipeline.run import GROUND_UNOBSERVABLE, Alignment
+from pipeline.sources import (
+    Configuration,
+    DriveForm,
+    DriveSource,
+    PoseContent,
+    PoseSource,
+    Sources,
+)
 from pipeline.stages import Cut, Finding, Given
 
 
@@ -166,3 +175,179 @@ def describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
         *gains,
         made.lag + made.delay,
     )
+
+
+# Examination of a log without poses: its command against its measured wheels, which stand in for the pose.
+#
+# What the wheels do with the command is observable without a pose; what the ground does is not.
+
+_REASON = "no pose is recorded: the motion of the wheels stands in"
+
+
+def examine_drive(given: Given) -> Recording | None:
+    """Let the measured wheels of a log without poses stand in for its pose.
+
+    Returns:
+        The recording; None if no candidate for wheels turns, or there is no command.
+    """
+    if given.may_move_sideways(given.sources):
+        # Of its motion to the side only the wheels of a known vehicle show anything.
+        return _take_by_name(given.sources, given.configuration) if given.is_known else None
+    return _stand_in(Case(given))
+
+
+def _take_by_name(sources: Sources, configuration: Configuration) -> Recording | None:
+    """The recording with the wheels that were chosen by type and name."""
+    if sources.wheels is None or sources.command is None:
+        return None
+    return Recording(_replace_pose(sources, sources.wheels), configuration, (_report_ground(sources.wheels),))
+
+
+def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
+    """Sources with these wheels in the rank of a pose, and without a gyro, which measures the ground."""
+    others = tuple(one for one in sources.rank_drives("wheels") if one != wheels)
+    pose = PoseSource(wheels.signals[0].topic, _REASON, content=PoseContent.WHEELS, wheels=wheels)
+    return replace(sources, wheels=None, pose=pose, imu=None, others={**sources.others, "wheels": others})
+
+
+def _report_ground(wheels: DriveSource) -> Finding:
+    text = (
+        f"the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so that the "
+        "drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
+        "ground does is not observable, and slip in these results is the difference between "
+        "commanded and measured wheels"
+    )
+    return Finding(GROUND_UNOBSERVABLE, "warning", text, where="pose")
+
+
+def _stand_in(case: Case) -> Recording | None:
+    """See `examine_drive`."""
+    wheels, motion = _find_wheels(case)
+    if wheels is None or motion is None:
+        return None
+    commands = _read_commands(case, motion, wheels)
+    case.sources = replace(case.sources, wheels=wheels.source)
+    command, _ = choose_roles(case, commands)
+    if command is None:
+        return None
+    steered = wheels.reading.form == "steering"
+    if leave_out(case, wheels, command, None):
+        kind = "ackermann" if steered else "differential"
+        reading = case.read(wheels.source, is_measured=True, kind=kind, section=case.complete().wheels)
+        rolled = None if reading is None else roll_wheels(reading)
+        if reading is not None and rolled is not None:
+            wheels.reading, motion = reading, rolled
+            for one in commands:
+                one.reading.explain(rolled)
+    settle_timeout(case, command, wheels, motion)
+    if wheels.reading.form == "sides":
+        report_dead(case, wheels, "the log holds no pose in its rank")
+        _find_unit(case, wheels, command)
+    if not case.findings or case.findings[-1].severity != "error":
+        _report_opposite(case, command, wheels)
+    case.driven = explain_wheels(command.reading, wheels.reading)
+    settle_delay(case, command, wheels, None)
+    sources = replace(case.sources, command=command.source)
+    alignment = measure_command(case, command, wheels, "ackermann" if steered else "")
+    return Recording(
+        _replace_pose(sources, wheels.source),
+        case.complete(),
+        (*case.findings, _report_ground(wheels.source)),
+        "ackermann" if steered else "",
+        _measure_lengths(case, command, wheels),
+        tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
+        alignment,
+    )
+
+
+def _find_wheels(case: Case) -> tuple[Candidate | None, Motion | None]:
+    """The first candidate for wheels that turn, and their motion in its own units."""
+    for number, source in enumerate(case.sources.rank_drives("wheels")):
+        for kind in ("ackermann", "differential"):
+            if kind == "ackermann" and source.form is not DriveForm.JOINTS:
+                continue
+            reading = case.read(source, is_measured=True, kind=kind)
+            if reading is None or not reading.inputs:
+                continue
+            if kind == "ackermann" and len(reading.inputs) < 2:  # noqa: PLR2004 - no joint steers
+                continue
+            motion = roll_wheels(reading)
+            if motion is not None:
+                return Candidate(source, reading, number, is_measured=True), motion
+    return None, None
+
+
+def _read_commands(case: Case, motion: Motion, wheels: Candidate) -> list[Candidate]:
+    """Candidates for the command, fitted to the motion of the wheels."""
+    taken = {signal.topic for signal in wheels.source.signals}
+    drives = []
+    for number, source in enumerate(case.sources.rank_drives("command")):
+        if taken & {signal.topic for signal in source.signals}:
+            continue
+        reading = case.read(source, is_measured=False)
+        if reading is not None:
+            reading.explain(motion)
+            drives.append(Candidate(source, reading, number, is_measured=False))
+    return drives
+
+
+def _report_opposite(case: Case, command: Candidate, wheels: Candidate) -> None:
+    """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
+    explained = command.reading.explained
+    if explained is None or not command.is_sure:
+        return
+    if is_crossed(command):
+        what = "one side of the wheels runs backward against its command"
+        mend = 'reversed = "left" or "right" under [wheels] in run.toml'
+        margin: float | None = explained.sign_margin
+    else:
+        against = [
+            verb
+            for verb, sign in (("drive", command.sign("ahead")), ("turn", command.sign("turned")))
+            if sign < 0
+        ]
+        if not against:
+            return
+        what = f"the wheels {enumerate_texts(against)} the other way than {command.source} commands"
+        changes = {"drive": "sign = -1 and exchanged = true", "turn": "exchanged = true"}
+        change = changes[against[0]] if len(against) == 1 else "sign = -1"
+        if wheels.reading.form != "sides":
+            change = "sign = -1"
+        mend, margin = f"{change} under [wheels] in run.toml", explained.moves
+    text = (
+        f"{what}, and no third signal shows which of them is wrong: either the encoders ({mend}), or the "
+        "command or the polarity of the motors, which are to be corrected on the robot"
+    )
+    case.findings.append(Finding("signs_contradict", "error", text, where="command, wheels", value=margin))
+
+
+def _find_unit(case: Case, wheels: Candidate, command: Candidate) -> None:
+    """Unit of the wheel speeds by the radius that each would mean."""
+    explained = command.reading.explained
+    if case.is_known or explained is None or not command.sign("ahead") or command.reading.form == "sides":
+        return
+    correct_wheel_unit(case, wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
+
+
+def _measure_lengths(case: Case, command: Candidate, wheels: Candidate) -> Geometry:
+    """Lengths by which the controller turns commands into motion of the wheels, whatever their signs."""
+    explained, form = command.reading.explained, wheels.reading.form
+    if explained is None or not command.is_sure or form == "body" or command.reading.form == "sides":
+        return Geometry()
+    fits = {"ahead": explained.ahead, "turned": explained.turned}
+    gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
+    errors = {name: 1.0 / max(abs(float(one.t[0])), 1e-9) for name, one in fits.items()}
+    if is_crossed(command):
+        # With one side reversed, the mean of the sides is half their difference, and the other way round.
+        gains = {"ahead": 0.5 * gains["turned"], "turned": 2.0 * gains["ahead"]}
+        errors = {"ahead": errors["turned"], "turned": errors["ahead"]}
+    elif not command.sign("ahead"):
+        return Geometry()
+    value = case.wheel_factor() / gains["ahead"]
+    radius, width = Length(value, errors["ahead"] * value), None
+    if command.reading.form == "body" and errors["turned"] < 1.0 / CLEAR:
+        value = gains["turned"] / gains["ahead"]
+        width = Length(value, value * float(np.hypot(errors["ahead"], errors["turned"])))
+    if form == "steering":
+        return Geometry(rolled=radius, wheelbase=width)
+    return Geometry(radius=radius, track=width)

@@ -11,9 +11,8 @@ import numpy as np
 from pipeline.core import format_share, join_parts
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
-from pipeline.recording.motion import STEP_S, Motion
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Motion, Steps
 from pipeline.recording.readings import SIDES, Explained, Reading
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
 from pipeline.sources import RANGES, DriveForm, find_alike
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")

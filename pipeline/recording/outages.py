@@ -14,9 +14,8 @@ import polars as pl
 
 from pipeline.core import Flags, Floats, Ints, enumerate_texts, find_scale, fit_robustly, list_likelihoods
 from pipeline.recording.case import Candidate, Case
-from pipeline.recording.motion import STEP_S, Motion
+from pipeline.recording.motion import STEP_S, Motion, Steps
 from pipeline.recording.readings import SIDES, Held, Reading
-from pipeline.recording.score import Steps
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import OutageSection
 from pipeline.stages import BLOCK_S, Finding, follow_likeliest, price_change

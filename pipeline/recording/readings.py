@@ -13,8 +13,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.core import Complex, Flags, Floats, join_parts, recur
-from pipeline.recording.motion import Motion
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit, measure_share
+from pipeline.recording.motion import (
+    CLEAR,
+    FEWEST_STEPS,
+    LEAST_NATS,
+    Fit,
+    Motion,
+    Steps,
+    compare,
+    fit,
+    measure_share,
+)
 
 GRID_S = 0.02
 _SLOW_S = 0.4

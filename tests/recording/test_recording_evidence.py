@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 from drawn_motion import GAIN, LAG, RADIUS, STEP, TRACK, command, draw, measured, sides, tabulate
 
+from pipeline.recording.encoders import Turning, compare_sides
 from pipeline.recording.evidence import (
     Units,
     find_body_units,
@@ -20,10 +21,8 @@ from pipeline.recording.evidence import (
     rate_command,
 )
 from pipeline.recording.geometry import explain_wheels, measure_controller, measure_geometry
-from pipeline.recording.motion import measure_motion
+from pipeline.recording.motion import FEWEST_STEPS, Steps, compare, fit, measure_motion
 from pipeline.recording.readings import Held, Reading
-from pipeline.recording.score import FEWEST_STEPS, Steps, compare, fit
-from pipeline.recording.wheel_scales import Turning, compare_sides
 
 
 def test_gain_and_delay_of_a_command_are_recovered() -> None:
