@@ -63,6 +63,8 @@ _SINGLES, _PAIRS = 4, 3
 """Extensions by one effect and by two that are fitted in each round."""
 _NEAR = 0.2
 """Share of what the best one explains that it may lack after them to be fitted to the end."""
+_SURE = 0.95
+"""Share of resampled recordings in which an effect must be better than a special case of it."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.95 has a standard error of 0.01."""
 
@@ -368,13 +370,31 @@ class Search:
                 pairs = (self._judge_last(fit, names) for names in groups if len(names) > 1)
                 refused = [one for one in pairs if one.refusal]
             if not refused:
-                return fit, alone
+                simpler = self._simplify(fit)
+                if simpler is None:
+                    return fit, alone
+                fit = simpler
             while refused:
                 # The least gain goes first; without it the next may be accepted.
                 least = min(refused, key=lambda one: (float(np.nan_to_num(one.gain)), one.added))
                 fit = self._drop(fit, least.added)
                 others = [one.added for one in refused if not set(one.added) & set(least.added)]
                 refused = [one for names in others if (one := self._judge_last(fit, names)).refusal]
+
+    def _simplify(self, fit: PartFit) -> PartFit | None:
+        """The model with a special case in the place of one that is nothing sure or felt beyond it."""
+        for effect in fit.state.effects:
+            taken = {effect.id, *self.given, *fit.ids}
+            cases = [one for one in self.candidates if one.id in effect.contains and one.id not in taken]
+            if effect.id in self.given or not cases:
+                continue
+            without = self._drop(fit, [effect.id])
+            for start in Screen(without, cases, self.conditions.largest).list_singles():
+                simpler = self.fit(start.add_to(without.state))
+                is_felt = _is_material(self.part, simpler.residual - fit.residual)
+                if not is_felt or self._judge(simpler, fit, is_final=True).frequency < _SURE:
+                    return simpler
+        return None
 
     def _judge_last(self, fit: PartFit, names: Collection[str]) -> Judged:
         """How effects of the last model are judged against the model without them."""

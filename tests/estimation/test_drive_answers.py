@@ -130,3 +130,19 @@ def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(tmp_path: Path) -> 
     for name in ("tau", "bound", "no_load", "scrub"):
         assert named["wheel_servo"][name].value == pytest.approx(servo[name], rel=0.05)
     assert named["motor_imbalance"]["e"].value == pytest.approx(0.22, rel=0.1)
+
+
+def test_a_lag_behind_a_limit_is_no_torque_limit(tmp_path: Path) -> None:
+    """A second limit of the same size differed by a millimetre, and was taken for what it imitated."""
+    hidden = {"drive_lag": {"tau": 0.315}, "acceleration_limit": {"limit": 3.66}}
+    scenario = Scenario(
+        vehicle=VEHICLES["husky"],
+        effects=hidden,
+        program=Program("drive_steps", step_s=6.0),
+        duration_s=150.0,
+        seed=2,
+        disturbance=Disturbance(0.03, 0.05),
+    )
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    told = _diagnose(tmp_path / "run.mcap")
+    assert {effect.id for effect in told.effects} == {*hidden}
