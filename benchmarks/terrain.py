@@ -20,7 +20,7 @@ from pipeline.datasets.terrain import PassEffect
 from pipeline.datasets.terrain_map import draw_up_terrain
 from pipeline.simulate import VEHICLES, Disturbance, Program, Scenario, simulate_run, write_log
 from pipeline.simulate.path import CompactedGround
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands
 from pipeline.store import Store
 
 KEPT = (1.0, 0.95, 0.9, 0.8)

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from pipeline.simulate import Disturbance, Scenario, State, simulate_run
 from pipeline.simulate.messages import Truth
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands
 
 _STEP_S = 0.01
 _EVERY = 5

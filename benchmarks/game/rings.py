@@ -47,7 +47,7 @@ from pipeline.simulate import (
     simulate_skid_steer,
     write_log,
 )
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands
 
 Floats = NDArray[np.float64]
 Json = dict[str, Any]

@@ -10,6 +10,7 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.core.arrays import (
+        LOG_PEAK,
         PAUSE_NS,
         PERIODS,
         ROUNDING_S,
@@ -19,12 +20,14 @@ if TYPE_CHECKING:
         Flags,
         Floats,
         Ints,
+        find_scale,
         fit_robustly,
         group_rows,
         guarded_spread,
         interpolate_linearly,
         jackknife_deviation,
         join_parts,
+        list_likelihoods,
         nearest_indices,
         number_stretches,
         recur,
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
         spread_equal,
         student_quantile,
         turn_units,
+        weigh,
     )
     from pipeline.core.compute import (
         Budget,
@@ -41,17 +45,6 @@ if TYPE_CHECKING:
         return_freed_memory,
         usable_threads,
         usual_budget,
-    )
-    from pipeline.core.levels import (
-        CONFIDENCE,
-        FEWEST_OF_SPREAD,
-        FOLDS,
-        JSON_DIGITS,
-        NORMAL_95,
-        finite_or_none,
-        pick,
-        pick_finite,
-        round_digits,
     )
     from pipeline.core.machine_code import (
         LANES,
@@ -89,17 +82,22 @@ if TYPE_CHECKING:
         rotate,
         rotation_vectors,
     )
-    from pipeline.core.student import LOG_PEAK, find_scale, list_likelihoods, weigh
     from pipeline.core.text import (
+        CONFIDENCE,
+        FEWEST_OF_SPREAD,
         FIGURES,
+        FOLDS,
         INPUT_WORDS,
         INPUTS,
+        JSON_DIGITS,
+        NORMAL_95,
         TREND_THRESHOLD,
         FigureFormat,
         SlipError,
         align_rows,
         count_places,
         enumerate_texts,
+        finite_or_none,
         format_angle,
         format_count,
         format_digits,
@@ -117,6 +115,9 @@ if TYPE_CHECKING:
         mark_finding,
         name_first,
         naming_os_errors,
+        pick,
+        pick_finite,
+        round_digits,
         shorten,
         split_interval,
         suffix_unit,

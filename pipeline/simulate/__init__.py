@@ -43,6 +43,7 @@ from pipeline.simulate.scenario import (
     TRACTION,
     Clock,
     Disturbance,
+    Drive,
     Encoders,
     Ground,
     Imu,
@@ -55,7 +56,6 @@ from pipeline.simulate.scenario import (
     Scenario,
     State,
 )
-from pipeline.simulate.signals import Drive
 
 Stamps = Ints
 

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.core import Floats
 from pipeline.simulate.facts import Effects, Vehicle
 from pipeline.simulate.programs import follow, hold_on_grid, lag_signal, limit_rate
-from pipeline.simulate.signals import Commands, Drive
+from pipeline.simulate.scenario import Commands, Drive
 
 # From commands to wheels: limits, deadband, delay, reversal, rate limit, lags and droop, in that order.
 #

@@ -17,8 +17,7 @@ from pipeline.core import (
 from pipeline.simulate.drivetrain import TURNING_MPS, move_by_corners, steer_tyres
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle
 from pipeline.simulate.programs import filter_pole, lag_signal, make_coloured_noise, walk_in_plane
-from pipeline.simulate.scenario import Disturbance, ExtraPhysics, Ground, State
-from pipeline.simulate.signals import Drive, integrate_cells
+from pipeline.simulate.scenario import Disturbance, Drive, ExtraPhysics, Ground, State, integrate_cells
 
 # From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
 #

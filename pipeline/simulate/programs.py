@@ -8,8 +8,7 @@ import numpy as np
 
 from pipeline.core import Floats
 from pipeline.simulate.facts import SimulateError, Vehicle, open_stream, unknown_name
-from pipeline.simulate.scenario import Program, Scenario
-from pipeline.simulate.signals import Commands, integrate_cells
+from pipeline.simulate.scenario import Commands, Program, Scenario, integrate_cells
 
 # Held signals, first-order lags, rate limits and coloured noise on a uniform grid.
 #

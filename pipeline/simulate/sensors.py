@@ -20,8 +20,7 @@ from pipeline.simulate.drivetrain import move_by_corners
 from pipeline.simulate.facts import Effects, Vehicle, open_stream, spread_times
 from pipeline.simulate.path import Path
 from pipeline.simulate.programs import make_coloured_noise
-from pipeline.simulate.scenario import Encoders, Imu, PoseSensor
-from pipeline.simulate.signals import Drive, integrate_cells
+from pipeline.simulate.scenario import Drive, Encoders, Imu, PoseSensor, integrate_cells
 
 _GYRO_WINDOW_S = 0.01
 _ACCELEROMETER_WINDOW_S = 0.05

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         temporary_beside,
     )
     from pipeline.store.generation import STEPS, Generation
-    from pipeline.store.identities import LogIdentities, LogSighting, see_log
     from pipeline.store.mirror import Mirror
     from pipeline.store.names import (
         Sample,
@@ -45,14 +44,15 @@ if TYPE_CHECKING:
         encode_parquet,
         list_complaints,
     )
-    from pipeline.store.queries import scan_table
-    from pipeline.store.results_folder import RUNS, Store
+    from pipeline.store.results_folder import RUNS, Store, scan_table
     from pipeline.store.stored_runs import (
         ANALYZE_FIRST,
         DIAGNOSIS,
         REPORT,
         SUMMARY,
         UPLOADS,
+        LogIdentities,
+        LogSighting,
         NoRunsError,
         find_log,
         find_recorded_log,
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
         name_run,
         read_choices,
         read_length_scale,
+        see_log,
         stored_contexts,
         stored_keys,
     )

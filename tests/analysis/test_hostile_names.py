@@ -14,7 +14,7 @@ from verbs import run_verb
 
 from pipeline.export import list_targets
 from pipeline.simulate import PLATFORMS, simulate_case
-from pipeline.simulate.published import Published
+from pipeline.simulate.facts import Published
 
 NAME = (
     'bot"""; EXECUTED = 1; """ \'\'\'---><include file="/etc/passwd"/><!--- '

@@ -18,8 +18,8 @@ from pipeline.core import SlipError
 from pipeline.logs import definition_text, open_log
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
+from pipeline.simulate.facts import Published, Q
 from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist
-from pipeline.simulate.published import Published, Q
 from pipeline.sources import load_configuration
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")

@@ -21,7 +21,7 @@ from pipeline.estimation.state import State
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Timing, find_effect
 from pipeline.simulate import Disturbance, Encoders, Program, simulate_run
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands
 from pipeline.words.effects import describe_separation
 
 if TYPE_CHECKING:

@@ -175,7 +175,7 @@ def test_generators_know_no_estimator() -> None:
         known = {one for one in found if one.startswith("pipeline")}
         assert known <= {
             "pipeline.simulate", "pipeline.simulate.messages", "pipeline.simulate.programs",
-            "pipeline.simulate.signals",
+            "pipeline.simulate.scenario",
         }, name  # fmt: skip
         own = {"game.draw", "game.sizes", "game.closed_loop", "game.odd", "game.held_out", "game.score"}
         assert {one for one in found if one.startswith("game")} <= own | {"game.recorded"}, name

@@ -5,7 +5,7 @@ from constants import choose_numbers, compare, replace_number
 
 from pipeline.estimation import decision
 from pipeline.run import signals
-from pipeline.stages import inputs, pose_faults, timing, trust
+from pipeline.stages import align, inputs, timing, trust
 
 
 def test_what_a_number_changes_is_told_in_words() -> None:
@@ -22,10 +22,10 @@ def test_a_shared_number_is_replaced_wherever_it_was_imported_and_put_back() -> 
 
 
 def test_a_private_number_of_another_file_is_another_number() -> None:
-    assert pose_faults._FEWEST == timing._FEWEST
+    assert align._FEWEST == timing._FEWEST
     with replace_number("pipeline.stages.timing", "_FEWEST", 0.5):
         assert timing._FEWEST == 100
-        assert pose_faults._FEWEST == 200
+        assert align._FEWEST == 200
 
 
 def test_without_files_all_rooms_that_decide_answers_are_asked() -> None:

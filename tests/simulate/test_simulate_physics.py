@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pipeline.core.rigid import rotate
 from pipeline.simulate.facts import CATALOGUE, VEHICLES
 from pipeline.simulate.messages import simulate_run
-from pipeline.simulate.scenario import Disturbance, Ground, Program, Scenario, State
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands, Disturbance, Ground, Program, Scenario, State
 
 Floats = NDArray[np.float64]
 Asked = Mapping[str, Mapping[str, float] | float]

@@ -20,7 +20,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.inputs import Ideal
 from pipeline.stages.motion_events import find_events

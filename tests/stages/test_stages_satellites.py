@@ -10,8 +10,8 @@ from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
 from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
+from pipeline.simulate.facts import Published
 from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
-from pipeline.simulate.published import Published
 from pipeline.simulate.sensors import to_earth
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver

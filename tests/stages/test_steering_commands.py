@@ -24,7 +24,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate.facts import DriveTopic
-from pipeline.simulate.signals import Commands
+from pipeline.simulate.scenario import Commands
 from pipeline.sources import find_preset
 from pipeline.store import Manifest
 

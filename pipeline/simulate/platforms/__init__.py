@@ -18,9 +18,14 @@ from pipeline.core import Floats, rigid
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.facts import (
     DriveTopic,
+    Json,
     Layout,
     PoseTopic,
+    Published,
+    Q,
     SimulateError,
+    Source,
+    Value,
     Vehicle,
     describe_robot,
     find_vehicle,
@@ -29,10 +34,8 @@ from pipeline.simulate.facts import (
 )
 from pipeline.simulate.messages import LATE_S, Field, Messages, SimulatedRun
 from pipeline.simulate.programs import make_wishes, walk_in_plane
-from pipeline.simulate.published import Json, Published, Q, Source, Value
-from pipeline.simulate.scenario import Scenario
+from pipeline.simulate.scenario import Scenario, integrate_cells
 from pipeline.simulate.sensors import to_earth
-from pipeline.simulate.signals import integrate_cells
 
 Series = dict[str, Floats]
 
