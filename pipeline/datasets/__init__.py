@@ -57,11 +57,13 @@ if TYPE_CHECKING:
         AS_PUBLISHED,
         DIFFERENT,
         EQUAL_DRIVING,
+        NO_SPREAD,
         OF_TWO_RUNS,
         UNTESTED,
         Answer,
         View,
         compare_orders,
+        foresee_pairs,
         judge_pair,
     )
     from pipeline.datasets.pooling import (

@@ -396,7 +396,9 @@ def find_causes(store: Store, question: Question) -> Causes:
         ComparisonError: ``nothing_to_compare``.
         ComparisonError: ``no_such_column``, ``no_such_vehicle``, ``no_such_dataset``.
     """
-    compared = find_material(store, question.by, trusted_only=True, tables=("budget", "estimates"))
+    compared = find_material(
+        store, question.by, trusted_only=True, tables=("budget", "estimates"), vehicle=question.vehicle
+    )
     compared = choose_runs(compared, question.vehicle, question.datasets)
     rows = read_budgets(compared)
     if rows.is_empty():

@@ -20,7 +20,7 @@ from pipeline.datasets.compared_runs import (
     measure_runs,
     note_untested,
 )
-from pipeline.datasets.equal_driving import Overlap, find_overlap, level_runs, measure_bins
+from pipeline.datasets.equal_driving import Levelled, Overlap, find_overlap, level_runs, measure_bins
 from pipeline.datasets.pairs import (
     ABOUT_UNIT,
     AS_DRIVEN,
@@ -36,7 +36,7 @@ from pipeline.datasets.pairs import (
     compare_groups,
     tabulate_pairs,
 )
-from pipeline.datasets.pooled_tests import bound_levels
+from pipeline.datasets.pooled_tests import bound_levels, level_groups
 from pipeline.datasets.pooling import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
 from pipeline.datasets.published_chain import follow_published, read_limits
 from pipeline.datasets.rank_tests import Interval, connect_groups
@@ -132,7 +132,7 @@ def compare_results(store: Store, question: Question) -> Answer:
         ComparisonError: ``nothing_to_compare``.
         ComparisonError: ``no_such_column``, ``no_such_vehicle``, ``no_such_dataset``.
     """
-    compared = find_material(store, question.by, trusted_only=True)
+    compared = find_material(store, question.by, trusted_only=True, vehicle=question.vehicle)
     compared = choose_runs(compared, question.vehicle, question.datasets)
     compared, runs, notes = measure_runs(compared)
     if runs.is_empty():
@@ -180,12 +180,15 @@ class _Material:
         labels = self.compared.labels.select("run", "group")
         bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
         driven = self._level_driving(bins, inputs)
+        at_equal = []
         for name in inputs:
             levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
             groups = _group_levels(levels)
-            overlaps = _find_overlaps(groups, levels, driven[name])
-            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps)
+            overlaps = _find_overlaps(groups, driven[name])
+            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps, driven[name])
+            at_equal.append(self._level_datasets(groups, name, driven[name]))
         datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
+        datasets = datasets.update(pl.concat(at_equal), on=["dataset", "input"])
         views = [View(*key, _list_levels(datasets, *key), table) for key, table in tables.items()]
         return self._answer(datasets, views, self.compared.scan("windows"), bins)
 
@@ -212,10 +215,15 @@ class _Material:
         return _group(self.compared, samples)
 
     def _compare(
-        self, groups: Sequence[Group], name: str, quantity: str, overlaps: Overlaps | None = None
+        self,
+        groups: Sequence[Group],
+        name: str,
+        quantity: str,
+        overlaps: Overlaps | None = None,
+        levelled: Mapping[str, Levelled] | None = None,
     ) -> pl.DataFrame:
         """Table `comparisons` of the groups by a quantity on an input."""
-        pairs = compare_groups(groups, untested=self.untested, overlaps=overlaps)
+        pairs = compare_groups(groups, untested=self.untested, overlaps=overlaps, levelled=levelled)
         self.notes += _sum_up(pairs, groups, _WORDS[quantity])
         keys = _keys(self.compared)
         return tabulate_pairs(pairs, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
@@ -226,15 +234,15 @@ class _Material:
         ends = {run: bound_run(samples[run]) for run in alone if run in samples}
         return {(run, name): one for run, one in ends.items() if one is not None}
 
-    def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, pl.DataFrame]:
-        """Give runs their levels at equal driving; the bins that count, by input."""
-        driven: dict[str, pl.DataFrame] = {}
+    def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, dict[str, Levelled]]:
+        """Give runs their levels at equal driving; what they are of, by input and dataset."""
+        driven: dict[str, dict[str, Levelled]] = {}
         for name in inputs:
-            counted = []
+            driven[name] = {}
             for datasets in self.families.values():
                 own = bins.filter(pl.col("input") == name, pl.col("group").is_in(list(datasets)))
                 levelled = level_runs(own)
-                counted.append(levelled.bins)
+                driven[name] |= dict.fromkeys(datasets, levelled)
                 if levelled.apart:
                     runs = ", ".join(levelled.apart)
                     why = f"a cell of driving counts from {FEWEST_OF_SPREAD} runs on"
@@ -245,11 +253,26 @@ class _Material:
                     pl.col("level").alias(EQUAL_DRIVING),
                 )
                 self.runs = self.runs.update(levels, on=["run", "input"])
-            driven[name] = pl.concat(counted)
         if short := sorted(set(self.compared.manifests) - set(bins["run"])):
             runs = ", ".join(short)
             self.notes.append(f"no level at equal driving, too little driving on commands: {runs}")
         return driven
+
+    def _level_datasets(
+        self, groups: Sequence[Group], name: str, driven: Mapping[str, Levelled]
+    ) -> pl.DataFrame:
+        """Levels of the datasets at equal driving, with their intervals."""
+        rows: list[tuple[str, float, float | None, float | None]] = []
+        for datasets in self.families.values():
+            if own := [group for group in groups if group.name in datasets]:
+                errors = driven[own[0].name].find_errors([run for group in own for run in group.names])
+                levels = level_groups([group.values for group in own], errors)
+                for group, (level, ends) in zip(own, levels, strict=True):
+                    rows.append((group.name, level, *((ends.low, ends.high) if ends else (None, None))))
+        numbers = dict.fromkeys((EQUAL_DRIVING, "equal_low", "equal_high"), pl.Float64)
+        return pl.DataFrame(rows, schema={"dataset": pl.String, **numbers}, orient="row").with_columns(
+            pl.lit(name).cast(self.runs.schema["input"]).alias("input")
+        )
 
     def _answer(
         self, datasets: pl.DataFrame, views: Sequence[View], windows: pl.LazyFrame, bins: pl.DataFrame
@@ -298,15 +321,16 @@ def _find_families(
 
 def _group_levels(levels: pl.DataFrame) -> list[Group]:
     parts = levels.sort("group", "run").partition_by("group", as_dict=True, maintain_order=True)
-    return [Group(str(name), rows[EQUAL_DRIVING].to_numpy()) for (name,), rows in parts.items()]
+    return [
+        Group(str(name), rows[EQUAL_DRIVING].to_numpy(), names=tuple(rows["run"]))
+        for (name,), rows in parts.items()
+    ]
 
 
-def _find_overlaps(
-    groups: Sequence[Group], levels: pl.DataFrame, bins: pl.DataFrame
-) -> dict[frozenset[str], Overlap]:
-    runs = {group.name: levels.filter(pl.col("group") == group.name)["run"].to_list() for group in groups}
+def _find_overlaps(groups: Sequence[Group], driven: Mapping[str, Levelled]) -> dict[frozenset[str], Overlap]:
     return {
-        frozenset((a, b)): find_overlap(bins, runs[a], runs[b]) for a, b in itertools.combinations(runs, 2)
+        frozenset((a.name, b.name)): find_overlap(driven[a.name].bins, a.names, b.names)
+        for a, b in itertools.combinations(groups, 2)
     }
 
 

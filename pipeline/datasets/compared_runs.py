@@ -78,6 +78,7 @@ def find_material(
     trusted_only: bool,
     tables: Sequence[str] = _TABLES,
     optional: Sequence[str] = (),
+    vehicle: str = "",
 ) -> ComparedRuns:
     """Select the current runs of the results, each recording once.
 
@@ -93,6 +94,7 @@ def find_material(
         tables: tables that a run must have.
         optional: tables that a run need not have, but whose file may not be missing if it does; with
             ``trusted_only`` these include the findings.
+        vehicle: the one that is asked about, if there is one of it: nothing is noted on runs of others.
 
     Raises:
         ComparisonError: ``by`` names no column.
@@ -115,7 +117,8 @@ def find_material(
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
-            reasons.setdefault(reason, []).append(manifest.run)
+            if not vehicle or manifest.part("vehicle").get("id") in (vehicle, None):
+                reasons.setdefault(reason, []).append(manifest.run)
             continue
         holders[digest] = manifest.run
         manifests[manifest.run] = manifest
@@ -131,6 +134,8 @@ def find_material(
     )
     labels = label_runs(dated, by)
     compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, date_notes)
+    if vehicle in set(labels["vehicle"]):
+        compared = choose_runs(compared, vehicle, ())
     reason = f"{' and '.join(by)} unknown, not pooled"
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
     compared = _leave_out_untrusted(compared) if trusted_only else compared

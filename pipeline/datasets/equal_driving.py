@@ -5,13 +5,14 @@ rate, and the logarithm of a bin's median slip modulus is the level of its run p
 levels of runs then compare grounds as if all runs had driven all bins.
 """
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD
+from pipeline.datasets.pooled_tests import Errors
 from pipeline.run import STILL_MPS
 
 SPEED_EDGES = (0.5, 1.0, 1.5, 2.0, 3.0, 6.0, 12.0, 24.0)
@@ -73,11 +74,19 @@ class Levelled:
             driven each; ``bins``: how many it did drive.
         bins: the bins that count, as from `measure_bins`.
         apart: runs that share no driving with the others, and have no level.
+        errors: of the logarithms of the levels, in the order of `runs`.
     """
 
     runs: pl.DataFrame
     bins: pl.DataFrame
     apart: tuple[str, ...]
+    errors: Errors
+
+    def find_errors(self, runs: Sequence[str]) -> Errors:
+        """Errors of the levels of these runs, in their order."""
+        own = self.runs["run"].to_list()
+        chosen = [own.index(run) for run in runs]
+        return replace(self.errors, shape=self.errors.shape[np.ix_(chosen, chosen)])
 
 
 def level_runs(bins: pl.DataFrame) -> Levelled:
@@ -100,13 +109,20 @@ def level_runs(bins: pl.DataFrame) -> Levelled:
     rows = np.arange(keyed.height)
     design[rows, [names.index(run) for run in keyed["run"]]] = 1.0
     design[rows, len(names) + keyed["column"].to_numpy().astype(np.int64)] = 1.0
-    effects = np.linalg.lstsq(design, np.log(keyed["modulus"].to_numpy()), rcond=None)[0]
-    usual = effects[len(names) :].mean() if names else 0.0
+    moduli = np.log(keyed["modulus"].to_numpy())
+    # Where the effects of bins add up to nothing, the effect of a run is its level.
+    sums = np.r_[np.zeros(len(names)), np.ones(combinations.height)]
+    made_of = np.linalg.solve(design.T @ design + np.outer(sums, sums), design.T)
+    effects = made_of @ moduli
+    levels = made_of[: len(names)]
     runs = pl.DataFrame(
-        {"run": names, "level": np.exp(effects[: len(names)] + usual)},
+        {"run": names, "level": np.exp(effects[: len(names)])},
         schema={"run": pl.String, "level": pl.Float64},
     ).join(counted.group_by("run").agg(pl.len().cast(pl.Int64).alias("bins")), on="run")
-    return Levelled(runs.sort("run"), counted, apart)
+    # Of connected runs and bins one effect follows from the others.
+    freedom = max(keyed.height - (len(names) + combinations.height - 1), 0)
+    errors = Errors(levels @ levels.T, float(np.sum((moduli - design @ effects) ** 2)), freedom)
+    return Levelled(runs.sort("run"), counted, apart, errors)
 
 
 def _keep_connected(bins: pl.DataFrame) -> pl.DataFrame:

@@ -12,13 +12,15 @@ import polars as pl
 import polars.selectors as cs
 
 from pipeline.core import FEWEST_OF_SPREAD, ROUNDING_S, STRETCH_S, Floats, number_in, pick
-from pipeline.datasets.equal_driving import Overlap
+from pipeline.datasets.equal_driving import Levelled, Overlap
 from pipeline.datasets.pooled_tests import (
     Difference,
+    Errors,
     MeansTest,
     bound_levels,
     compare_means,
     exponentiate,
+    foresee_significant,
     pool_spread,
     take_logarithms,
 )
@@ -97,11 +99,13 @@ class Group:
         name: its name.
         values: the compared quantity of each run, shape (runs,).
         runs: samples of each run; empty where only the values are known.
+        names: the runs' names, where errors of their values are known.
     """
 
     name: str
     values: Floats
     runs: tuple[Samples, ...] = ()
+    names: tuple[str, ...] = ()
 
     @classmethod
     def of_runs(cls, name: str, runs: Sequence[Samples]) -> Group:
@@ -125,7 +129,8 @@ class Pair:
         smallest_p: smallest p possible with these counts, whatever the difference.
         unit: `RUNS` or `BLOCKS`.
         method: test and correction in words.
-        spread: standard deviation of the logarithm between runs of a group, pooled over the groups.
+        spread: standard deviation of the logarithm between runs of a group, pooled over the groups; at equal
+            driving between those that are known as well as the median one.
         freedom: its degrees of freedom.
         p_uncorrected: plain Mann-Whitney over all samples; not valid.
         note: remark on the interpretation; may be empty.
@@ -160,6 +165,7 @@ def compare_groups(
     *,
     untested: Collection[frozenset[str]] = (),
     overlaps: Mapping[frozenset[str], Overlap] | None = None,
+    levelled: Mapping[str, Levelled] | None = None,
 ) -> list[Pair]:
     """Compare pairs of groups.
 
@@ -171,6 +177,7 @@ def compare_groups(
         groups: groups of at least one run each.
         untested: names of pairs that are not compared.
         overlaps: driving in common by the names of a pair; pairs without any get no number.
+        levelled: where the values are levels, what they are of, by group; it is one for all of a family.
     """
     numbered = [
         (i, j)
@@ -183,7 +190,9 @@ def compare_groups(
         pairs = [(family.index(i), family.index(j)) for i, j in numbered if i in family]
         by_runs = any(group.values.size > 1 for group in own) or not all(group.runs for group in own)
         units = [group.values for group in own] if by_runs else _cut_alike([group.runs[0] for group in own])
-        compared += _compare_family(own, units, pairs, overlaps, RUNS if by_runs else BLOCKS)
+        runs = [run for group in own for run in group.names]
+        errors = levelled[own[0].name].find_errors(runs) if levelled else None
+        compared += _compare_family(own, units, pairs, overlaps, errors, RUNS if by_runs else BLOCKS)
     return sorted(compared, key=lambda pair: (pair.a.name, pair.b.name))
 
 
@@ -207,6 +216,7 @@ def _compare_family(
     values: Sequence[Floats],
     pairs: Sequence[tuple[int, int]],
     overlaps: Mapping[frozenset[str], Overlap] | None,
+    errors: Errors | None,
     unit: str,
 ) -> list[Pair]:
     """Pairs by units; without any spread between units only ratios."""
@@ -216,7 +226,7 @@ def _compare_family(
         for i, j in pairs
         if overlaps is None or overlaps[frozenset((groups[i].name, groups[j].name))].bins
     ]
-    test, differences = _test_units(units, known, unit)
+    test, differences = _test_units(units, known, errors, unit)
     compared = []
     for i, j in pairs:
         a, b = groups[i], groups[j]
@@ -231,11 +241,12 @@ def _compare_family(
         pair = replace(
             pair, shift=shift_between(values[i], values[j]), cliffs_delta=delta, size=name_delta(delta)
         )
+        difference = differences.get((i, j))
         if positive:
-            pair = replace(pair, ratio=exponentiate(float(units[j].mean() - units[i].mean())))
+            usual = float(units[j].mean() - units[i].mean())
+            pair = replace(pair, ratio=exponentiate(difference.value if difference else usual))
         if a.runs and b.runs:
             pair = replace(pair, p_uncorrected=_ask_published(a, b))
-        difference = differences.get((i, j))
         if test is None or difference is None:
             compared.append(replace(pair, note=NO_SPREAD if unit == RUNS else TOO_SHORT))
             continue
@@ -253,7 +264,7 @@ def _compare_family(
 
 
 def _test_units(
-    units: Sequence[Floats], pairs: Sequence[tuple[int, int]], unit: str
+    units: Sequence[Floats], pairs: Sequence[tuple[int, int]], errors: Errors | None, unit: str
 ) -> tuple[MeansTest | None, dict[tuple[int, int], Difference]]:
     """Test of the pairs with enough units, and its differences by pair.
 
@@ -265,7 +276,9 @@ def _test_units(
     values = [units[index] for index in valid]
     if not asked or not pool_spread(values)[1]:
         return None, {}
-    test = compare_means(values, [(valid.index(i), valid.index(j)) for i, j in asked], unit=unit)
+    test = compare_means(
+        values, [(valid.index(i), valid.index(j)) for i, j in asked], unit=unit, errors=errors
+    )
     return test, dict(zip(asked, test.differences, strict=True))
 
 
@@ -348,6 +361,58 @@ def judge_pair(row: Mapping[str, object]) -> str:
     if adjusted <= LEVEL:
         return DIFFERENT if row["unit_of_analysis"] == RUNS else OF_TWO_RUNS
     return ALIKE if smallest <= LEVEL else UNTESTED
+
+
+MOST_ADDED = 9
+"""Most runs of each dataset that are foreseen: a season's; who needs more will not drive them."""
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """What more runs would tell, if differences and the spread between runs stay as they are.
+
+    Attributes:
+        added: more runs of each dataset.
+        pairs: pairs that would then be significant.
+    """
+
+    added: int
+    pairs: tuple[tuple[str, str], ...]
+
+
+def foresee_pairs(rows: Collection[Mapping[str, object]]) -> list[Foreseen]:
+    """Numbers of runs that would make the first pair more significant, and half of the pairs.
+
+    Args:
+        rows: rows of `comparisons` of one family, of one view.
+
+    Returns:
+        At most two; none where no spread between runs is known, half of the pairs are significant, or
+        `MOST_ADDED` runs are not enough.
+    """
+    judged = [
+        row for row in rows if judge_pair(row) in (DIFFERENT, ALIKE) and row["unit_of_analysis"] == RUNS
+    ]
+    spread, freedom = next(((row["spread"], row["freedom"]) for row in judged), (None, None))
+    if not isinstance(spread, float) or not isinstance(freedom, int):
+        return []
+    counts = {str(row[k]): int(str(row[f"runs_{k}"])) for row in judged for k in ("a", "b")}
+    differences = [
+        (str(row["a"]), str(row["b"]), math.log(ratio))
+        for row in judged
+        if (ratio := number_in(row, "ratio")) is not None
+    ]
+    significant = sum(judge_pair(row) == DIFFERENT for row in judged)
+    foreseen: list[Foreseen] = []
+    for added in range(1, MOST_ADDED + 1) if 2 * significant < len(judged) else ():
+        sizes = {name: count + added for name, count in counts.items()}
+        pairs = foresee_significant(differences, sizes, spread, freedom + added * len(counts))
+        is_half = 2 * len(pairs) >= len(judged)
+        if len(pairs) > significant and (is_half or not foreseen):
+            foreseen.append(Foreseen(added, tuple(pairs)))
+        if is_half:
+            break
+    return foreseen
 
 
 ABOUT_UNIT = (

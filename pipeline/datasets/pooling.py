@@ -365,19 +365,17 @@ def pool_runs(
         pl.col("place").sort().str.join(" ").alias("keys"),
         pl.col("median_modulus").drop_nulls().alias("moduli"),
         pl.col("median_window_norm").drop_nulls().alias("norms"),
-        pl.col("equal_modulus").drop_nulls().alias("levels"),
-        pl.col("equal_modulus").log().mean().exp(),
+        *(pl.lit(None, pl.Float64).alias(name) for name in ("equal_modulus", "equal_low", "equal_high")),
         pl.col("run").first().alias("only"),
     )
     ends = {
         **_bound_groups(grouped, "moduli", within, ("low", "high", "interval")),
         **_bound_groups(grouped, "norms", norms_within, ("norm_low", "norm_high", "norm_interval")),
-        **_bound_groups(grouped, "levels", {}, ("equal_low", "equal_high", "equal_interval")),
     }
     return (
         grouped.with_columns(**ends)
         .rename({"group": "dataset"})
-        .drop("moduli", "norms", "levels", "only", "norm_interval", "equal_interval")
+        .drop("moduli", "norms", "only", "norm_interval")
         .sort("dataset", "input")
     )
 

@@ -18,12 +18,15 @@ from pipeline.datasets import (
     ALIKE,
     AS_PUBLISHED,
     DIFFERENT,
+    NO_SPREAD,
     NOT_VALID,
     OF_TWO_RUNS,
+    SPEED_EDGES,
     UNTESTED,
     Answer,
     View,
     compare_orders,
+    foresee_pairs,
     judge_pair,
 )
 
@@ -44,7 +47,7 @@ class Line:
     Attributes:
         family: vehicles that it is about.
         input: input u.
-        driving: `as driven`, `at equal driving`, `as published`, or `the difference`.
+        driving: `as driven`, `at equal driving`, `as published`, `the difference`, or `to know more`.
         text: the sentence, without these.
     """
 
@@ -55,7 +58,7 @@ class Line:
 
 
 def list_lines(answer: Answer) -> list[Line]:
-    """The answer, at most three lines for each vehicle and input."""
+    """The answer, at most four lines for each vehicle and input."""
     lines = []
     for family, datasets in answer.families.items():
         labels = shorten_names(family, datasets)
@@ -80,6 +83,9 @@ def list_lines(answer: Answer) -> list[Line]:
                 carrier = answer.carriers.get((name, frozenset(extremes)), "")
                 text += f"; as driven it is carried by {carrier}" * bool(carrier)
                 lines.append(Line(family, name, "the difference", text))
+            undriven = _find_undriven(answer, name, [one for one, _ in equal.levels], labels)
+            if advice := _advise_runs(equal, undriven):
+                lines.append(Line(family, name, "to know more", advice))
     return lines
 
 
@@ -297,6 +303,34 @@ def _split_difference(
         f"{start}: a factor {format_two(driving)} is the driving, {format_two(ground_factor)} the "
         f"ground{sure} ({common})"
     )
+
+
+def _advise_runs(equal: _Part, undriven: Sequence[str]) -> str:
+    """Runs that would make differences at equal driving significant, and how to drive them; or nothing."""
+    rows = equal.pairs.values()
+    if any(row["note"] == NO_SPREAD for row in rows):
+        return "two more runs on any of these grounds would show how much runs of one ground differ"
+    foreseen = foresee_pairs(rows)
+    if not foreseen:
+        return ""
+    first, *later = foreseen
+    count = format_count(first.added, "more run")
+    text = f"{count} on each ground would make about {len(first.pairs)} of {len(rows)} pairs significant"
+    text += "".join(f", {one.added} more {len(one.pairs)}" for one in later)
+    return "; ".join([f"{text}, if runs go on to differ as these do", *undriven])
+
+
+def _find_undriven(
+    answer: Answer, input_name: str, datasets: Sequence[str], labels: Mapping[str, str]
+) -> list[str]:
+    """Datasets that lack the highest speeds of all others, and from which speed on."""
+    own = answer.bins.filter(pl.col("input") == input_name, pl.col("group").is_in(list(datasets)))
+    fastest = dict(own.group_by("group").agg(pl.col("speed").max()).iter_rows())
+    slow = min(fastest, key=lambda name: fastest[name])
+    others = min((speed for name, speed in fastest.items() if name != slow), default=0)
+    if fastest[slow] >= others:
+        return []
+    return [f"drive {labels[slow]} above {SPEED_EDGES[fastest[slow]]:g} m/s, too, as the others were"]
 
 
 def title_line(line: Line) -> str:

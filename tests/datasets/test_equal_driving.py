@@ -13,8 +13,8 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.compare import compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
-from pipeline.datasets.pairs import Answer
-from pipeline.datasets.pooled_tests import compare_means
+from pipeline.datasets.pairs import Answer, foresee_pairs
+from pipeline.datasets.pooled_tests import Errors, compare_means
 from pipeline.store import Store
 from pipeline.words.comparison import list_lines, list_pairs
 
@@ -115,6 +115,108 @@ def test_random_halves_of_one_ground_alarm_once_in_twenty() -> None:
     for what, count in alarms.items():
         # Splits of the same runs are not independent: the error is that of the draws, at most.
         assert 0.01 <= count / (draws * splits) <= 0.05 + 2.6 * np.sqrt(0.05 * 0.95 / draws / 5), what
+
+
+def draw_bins(
+    rng: np.random.Generator, cells: list[int], levels: list[float], between: float
+) -> pl.DataFrame:
+    """Runs with so many of 28 bins each, whose slip scatters by .3 about the levels of run and bin."""
+    parts = []
+    for run, (count, level) in enumerate(zip(cells, levels, strict=True)):
+        chosen = rng.choice(28, count, replace=False)
+        logs = level + rng.normal(0.0, between) + 0.1 * chosen + rng.normal(0.0, 0.3, count)
+        parts.append(
+            pl.DataFrame({"speed": chosen // 4, "turn": chosen % 4, "modulus": np.exp(logs)}).with_columns(
+                pl.lit(f"r{run}").alias("run"), pl.lit(300).alias("samples")
+            )
+        )
+    return pl.concat(parts)
+
+
+@pytest.mark.parametrize("between", [0.0, 0.2])
+def test_a_ground_with_one_run_of_two_cells_alarms_once_in_twenty(between: float) -> None:
+    """Its level is known much less than those of others: a spread pooled over runs alarmed in a third."""
+    rng, draws = np.random.default_rng(6), 150
+    cells, sizes = [25, 25, 25, 25, 25, 25, 2], [3, 3, 1]
+    truth = np.repeat([0.0, 0.7, -0.4], sizes)
+    missed = {"weighed": 0, "alike": 0}
+    for _ in range(draws):
+        levelled = level_runs(draw_bins(rng, cells, truth.tolist(), between))
+        groups = np.split(np.log(levelled.runs["level"].to_numpy()), [3, 6])
+        pairs = [(0, 1), (0, 2), (1, 2)]
+        for what, errors in (("weighed", levelled.errors), ("alike", None)):
+            test = compare_means(groups, pairs, errors=errors)
+            for (i, j), one in zip(pairs, test.differences, strict=True):
+                true = [0.0, 0.7, -0.4][j] - [0.0, 0.7, -0.4][i]
+                assert one.interval is not None
+                if not one.interval.low <= true <= one.interval.high:
+                    missed[what] += 1
+                    break
+    assert missed["weighed"] / draws <= 0.05 + 2.6 * np.sqrt(0.05 * 0.95 / draws)
+    if not between:
+        assert missed["alike"] > 5 * missed["weighed"], "which is what errors of cells are for"
+
+
+def test_runs_of_few_cells_hide_nothing_that_the_others_tell() -> None:
+    """Of three runs of each ground one has three cells: a factor of 1.5 is found nearly always."""
+    rng, draws = np.random.default_rng(8), 40
+    found = {"weighed": 0, "alike": 0}
+    for _ in range(draws):
+        bins = draw_bins(rng, [25, 25, 3, 25, 25, 3, 25, 25, 3], [0.0] * 3 + [0.1] * 3 + [0.4] * 3, 0.02)
+        levelled = level_runs(bins)
+        groups = np.split(np.log(levelled.runs["level"].to_numpy()), [3, 6])
+        for what, errors in (("weighed", levelled.errors), ("alike", None)):
+            found[what] += (
+                compare_means(groups, [(0, 1), (0, 2), (1, 2)], errors=errors).differences[1].p_adjusted
+                <= 0.05
+            )
+    assert found["weighed"] >= 0.9 * draws
+    assert found["alike"] < found["weighed"]
+
+
+def test_values_that_are_known_exactly_are_compared_by_tukey_and_kramer() -> None:
+    rng = np.random.default_rng(2)
+    groups = [rng.normal(0.1 * i, 0.1, size) for i, size in enumerate((3, 4, 1))]
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    nearly = Errors(1e-6 * np.diag(rng.uniform(0.5, 2.0, 8)), 9.0, 100)
+    weighed, plain = compare_means(groups, pairs, errors=nearly), compare_means(groups, pairs)
+    assert plain.method.startswith("Tukey-Kramer")
+    assert weighed.spread == pytest.approx(plain.spread, rel=1e-3)
+    for one, other in zip(weighed.differences, plain.differences, strict=True):
+        assert one.value == pytest.approx(other.value, abs=1e-4)
+        assert one.p_adjusted == pytest.approx(other.p_adjusted, abs=0.02)
+        assert one.p == pytest.approx(other.p, abs=0.02)
+        assert one.interval is not None
+        assert other.interval is not None
+        assert one.interval.low == pytest.approx(other.interval.low, rel=0.05)
+
+
+def test_the_runs_that_would_tell_are_foreseen() -> None:
+    """Spread .2, three grounds of two runs: what is foreseen is what drawn runs of that many show."""
+    rows = [
+        {
+            "a": a, "b": b, "runs_a": 2, "runs_b": 2, "ratio": float(np.exp(log)), "spread": 0.2,
+            "freedom": 3, "p_adjusted": 0.3, "smallest_p": 0.0, "unit_of_analysis": "runs",
+        }
+        for a, b, log in (("ice", "mud", 0.0), ("grass", "ice", 0.6), ("grass", "mud", 0.6))
+    ]  # fmt: skip
+    (foreseen,) = foresee_pairs(rows)
+    assert set(foreseen.pairs) == {("grass", "ice"), ("grass", "mud")}
+    rng, size = np.random.default_rng(3), 2 + foreseen.added
+    counts = []
+    for count in (size - 1, size):
+        limit = []
+        for _ in range(200):
+            groups = [rng.normal(mean, 0.2, count) for mean in (0.0, 0.6, 0.6)]
+            limit += [
+                one.p_adjusted <= 0.05 for one in compare_means(groups, [(0, 1), (0, 2)], tests=9).differences
+            ]
+        counts.append(np.mean(limit))
+    assert counts[0] < 0.5 < counts[1] + 0.1
+    sure = [{**row, "p_adjusted": 0.01} for row in rows]
+    assert foresee_pairs(sure) == [], "half of the pairs are known"
+    assert foresee_pairs([{**row, "spread": None, "freedom": None} for row in rows]) == []
+    assert foresee_pairs([{**row, "ratio": 1.0} for row in rows]) == [], "what does not differ, no run shows"
 
 
 @pytest.fixture
