@@ -169,7 +169,7 @@ class Work:
         setup = self.setup
         data = self.data if self.data is not None else read_wanted(setup, self.sha256)
         known = setup.choice.recording
-        made = setup.choice.extracted or extract_tables(
+        made = extract_tables(
             Given(
                 data,
                 setup.sources,
@@ -181,7 +181,7 @@ class Work:
         )
         # Columns and tables are large: drop the references as early as possible.
         self.data, data = None, replace(data, topics=())
-        self.setup = replace(setup, choice=replace(setup.choice, data=None, extracted=None))
+        self.setup = replace(setup, choice=replace(setup.choice, data=None))
         extracted = {
             name: check_table(name, self._identify(name, as_recorded(name, frame)))
             for name, frame in made.tables.items()

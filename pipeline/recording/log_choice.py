@@ -62,7 +62,7 @@ from pipeline.sources import (
     recognize_vehicle,
     resolve_vehicle,
 )
-from pipeline.stages import Extracted, Finding, Given, find_sideways_share, list_wanted, with_texts
+from pipeline.stages import Finding, Given, find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
@@ -151,7 +151,6 @@ class Choice:
         ratings: candidates for the pose, the best first; empty if nothing was compared.
         findings: findings on the choice.
         data: data read for the choice; None if names were sufficient.
-        extracted: tables of the stage `extract`, if the choice needed them; ``data`` then has no columns.
         recording: what the signals show; None without a pose.
     """
 
@@ -161,7 +160,6 @@ class Choice:
     ratings: tuple[PoseRating, ...] = ()
     findings: tuple[Finding, ...] = ()
     data: LogData | None = None
-    extracted: Extracted | None = None
     recording: Recording | None = None
 
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
@@ -251,7 +249,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     fits = problem is not None and pose is not None and (sources.wheels or sources.command) is not None
     # Missing data are reported before an unknown vehicle.
     if problem is None or not fits:
-        return _release_columns(chosen)
+        return chosen
     return _fit_vehicle(chosen, configuration, problem, known)
 
 
@@ -512,21 +510,12 @@ def _compare(
             ratings = (other, *(one for one in ratings if one is not other))
             recording = made
             break
-    # Candidates are rated as recorded, without intervals, and with the wheels that were chosen by name.
-    roles = recording.sources.command, recording.sources.wheels
-    as_rated = (
-        recording.configuration == configuration
-        and sources.interval is None
-        and roles == (chosen.sources.command, chosen.sources.wheels)
-    )
-    extracted = ratings[0].made if ratings and as_rated else None
     return replace(
         chosen,
         sources=recording.sources,
-        ratings=tuple(replace(rating, made=None) for rating in ratings),
+        ratings=ratings,
         findings=(*findings, *recording.findings),
         data=data,
-        extracted=extracted,
         recording=recording,
     )
 
@@ -545,13 +534,6 @@ def _list_equals(ratings: Sequence[PoseRating]) -> list[PoseRating]:
     return [
         one for one in ratings[1:] if not (one.refusal or one.from_wheels) and one.score == ratings[0].score
     ]
-
-
-def _release_columns(chosen: Choice) -> Choice:
-    """Drop the columns if the tables of the stages exist already."""
-    if chosen.data is None or chosen.extracted is None:
-        return chosen
-    return replace(chosen, data=replace(chosen.data, topics=()))
 
 
 def _fit_vehicle(
@@ -626,7 +608,6 @@ def _fit_vehicle(
         vehicle_source="fitted",
         sources=sources,
         findings=tuple(findings),
-        extracted=None,
     )
 
 

@@ -25,7 +25,7 @@ from pipeline.sources import (
     is_localization,
 )
 from pipeline.stages.drive import read_speed
-from pipeline.stages.extract import Extracted, Given, extract_tables
+from pipeline.stages.extract import Given, extract_tables
 from pipeline.stages.findings import Finding
 from pipeline.stages.pose_topics import SLOW_HZ
 from pipeline.stages.reading import FEWEST_MESSAGES
@@ -70,7 +70,6 @@ class PoseRating:
         reason: as text.
         refusal: why it is unusable; empty if it is usable.
         stands: whether it is unusable since it never changes.
-        made: tables extracted for the rating, without intervals; of the best candidate only.
         position: its positions [m], shape (n, 2), until copies are found.
         same_as: a topic with the same positions, wheel odometry or the best candidate; empty without one.
     """
@@ -86,7 +85,6 @@ class PoseRating:
     reason: str = ""
     refusal: str = ""
     stands: bool = False
-    made: Extracted | None = None
     position: Floats | None = None
     same_as: str = ""
 
@@ -108,11 +106,10 @@ def rate_poses(given: Given) -> tuple[PoseRating, ...]:
     if sources.pose is None:
         return ()
     others = [source for source in sources.others.get("pose", ()) if isinstance(source, PoseSource)]
-    ratings: list[PoseRating] = []
-    for candidate in (sources.pose, *others):
-        ratings.append(_rate(given, candidate))
-        ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
-        ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
+    ratings = sorted(
+        (_rate(given, one) for one in (sources.pose, *others)),
+        key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz),
+    )
     rated = [_find_copy(one, ratings) for one in ratings]
     best = rated[0]
     driven = {signal.topic for drive in sources.rank_drives("wheels") for signal in drive.signals}
@@ -209,7 +206,6 @@ def _rate(given: Given, pose: PoseSource) -> PoseRating:
         from_wheels=from_wheels,
         score=score,
         reason=", ".join(reasons),
-        made=made,
         position=position,
     )
 
