@@ -29,7 +29,7 @@ from pipeline.run import (
     tabulate_alignment,
 )
 from pipeline.sources import Vehicle, VelocitySection
-from pipeline.stages.drive import Drive, interpolate_readings
+from pipeline.stages.drive import SIGNALS, interpolate_readings
 from pipeline.stages.drive_numbers import mark_late_starts
 from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import interpolate_wheels, usual_hold
@@ -187,7 +187,7 @@ def measure_body_multiplier(commands: pl.DataFrame, vehicle: Vehicle) -> float |
     live = commands.filter(pl.all_horizontal(pl.col(name).is_finite() for name in asked_for))
     if live.is_empty():
         return None
-    driven = [name for name in Drive.list_signals() if name in live.columns and not name.startswith("body")]
+    driven = [name for name in SIGNALS if name in live.columns and not name.startswith("body")]
     inputs = {name: np.nan_to_num(live[name].cast(pl.Float64).to_numpy()) for name in driven}
     rolled = vehicle.kinematics.forward(inputs, vehicle)
     label = arrays.number_stretches(live["t"].to_numpy() - float(live["t"][0]), ANSWERS_S)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core import Flags, Floats, Ints, spread_equal
+from pipeline.core import Flags, Floats, spread_equal
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import (
@@ -46,44 +45,17 @@ _COUNTERS = (2.0**16, 2.0**32)
 """Numbers of ticks after which encoder counters wrap around."""
 
 
-@dataclass(frozen=True)
-class Drive:
-    """Drive signals of one message series; quantities that the form lacks are None.
-
-    Attributes:
-        left: speed of the left wheels [rad/s], shape (n,).
-        right: speed of the right wheels [rad/s].
-        speed: speed [m/s] (Ackermann).
-        steering: steering angle [rad] (Ackermann).
-        sideways: wheel speed that moves the vehicle to the left [rad/s] (mecanum, omni).
-        body_x: forward speed of the body command [m/s].
-        body_y: speed to the left of the body command [m/s] (mecanum, omni).
-        body_w: yaw rate of the body command [rad/s].
-    """
-
-    left: Floats | None = None
-    right: Floats | None = None
-    speed: Floats | None = None
-    steering: Floats | None = None
-    sideways: Floats | None = None
-    body_x: Floats | None = None
-    body_y: Floats | None = None
-    body_w: Floats | None = None
-    findings: tuple[Finding, ...] = field(default=())
-
-    @classmethod
-    def list_signals(cls) -> tuple[str, ...]:
-        """Names of the signals, in the order of the tables' columns."""
-        return tuple(name for name in cls.__dataclass_fields__ if name != "findings")
-
-    def take(self, order: Ints) -> Drive:
-        """The signals in another order."""
-        series = {name: getattr(self, name) for name in self.list_signals()}
-        taken = {name: None if values is None else values[order] for name, values in series.items()}
-        return Drive(**taken, findings=self.findings)
+SIGNALS = ("left", "right", "speed", "steering", "sideways", "body_x", "body_y", "body_w")
+"""Signals of a drive, in the order of the tables' columns: speeds of the left and the right wheels [rad/s];
+speed [m/s] and steering angle [rad] (Ackermann); wheel speed that moves the vehicle to the left [rad/s]
+(mecanum, omni); and of a body command the speeds ahead and to the left [m/s] and the yaw rate [rad/s]."""
+Drive = dict[str, Floats]
+"""Those that the form of a message series has, by name, shape (n,) each."""
 
 
-def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
+def read_joints(
+    columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle
+) -> tuple[Drive, list[Finding]]:
     """Joint states: wheels by joint name, averaged per side.
 
     Args:
@@ -113,16 +85,18 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     recorded = [joint for joint in (*left, *right) if joint not in missing]
     section, converted = _convert_unit(columns.topic, times, section, velocity, position, recorded)
     findings += converted
-    for side, joints_of_it in chosen.items():
-        for joint in joints_of_it:
-            velocity[joint] = velocity[joint] * _find_factor(section, side, joint)
+    velocity |= {
+        joint: velocity[joint] * _find_factor(section, side, joint)
+        for side, joints_of_it in chosen.items()
+        for joint in joints_of_it
+    }
     if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
         if not wheels:
             raise _no_wheels(columns.topic, joints)
         speed = _to_radps(np.mean(wheels, axis=0), section, vehicle) * vehicle.wheel_radius_m
-        return Drive(speed=speed, steering=steering, findings=tuple(findings))
+        return {"speed": speed, "steering": steering}, findings
     if not left or not right:
         raise _no_wheels(columns.topic, joints)
     sides = [
@@ -130,21 +104,21 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         for side in (left, right)
     ]
     speeds = {joint: _to_radps(velocity[joint], section, vehicle) for joint in (*left, *right)}
-    moves = vehicle.kinematics.has_inputs("sideways")
-    sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
-    return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(findings))
+    drive = dict(zip(SIDES, sides, strict=True))
+    if vehicle.kinematics.has_inputs("sideways"):
+        drive["sideways"] = _mean_sideways(speeds, left, section, columns.topic)
+    return drive, findings
 
 
 def is_of_wheels(columns: TopicColumns, drive: Drive) -> Flags:
     """Messages that hold the joints of a drive, shape (n,): others of the topic may be of an arm."""
     joints = find_type(columns.type_name).joints
     names = None if joints is None else columns.fields[joints.names]
-    signals = [one for name in Drive.list_signals() if (one := getattr(drive, name)) is not None]
-    if not isinstance(names, RaggedStrings) or not signals:
+    if not isinstance(names, RaggedStrings) or not drive:
         return np.ones(columns.log_time.size, dtype=bool)
     sizes = np.diff(names.offsets)
     kinds = names.at(0).codes.astype(np.int64) * (1 + int(sizes.max(initial=0))) + sizes
-    read = np.any([np.isfinite(one) for one in signals], axis=0)
+    read = np.any([np.isfinite(one) for one in drive.values()], axis=0)
     return np.isin(kinds, kinds[read])
 
 
@@ -488,14 +462,15 @@ def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
         what = f"a pair of wheel speeds does not say how {vehicle.name} ({vehicle.kind}) moves sideways"
         hint = "Configure a topic of body motion with linear.y, or a JointState of all wheels."
         raise StageError("no_sideways", what, where="configuration", hint=hint)
-    return Drive(left=left, right=right)
+    return {"left": left, "right": right}
 
 
 def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Floats | None = None) -> Drive:
     """A body command, converted into the drive's inputs by the vehicle's ideal inverse."""
     aside = np.zeros_like(forward) if sideways is None else sideways
     inputs = vehicle.kinematics.inverse((forward, aside, yaw_rate), vehicle)
-    return Drive(**inputs, body_x=forward, body_y=sideways, body_w=yaw_rate, findings=())
+    body = {"body_x": forward, "body_w": yaw_rate} | ({} if sideways is None else {"body_y": sideways})
+    return {**inputs, **body}
 
 
 def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
@@ -504,7 +479,7 @@ def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
         what = f"speed and steering cannot drive {vehicle.name}, which is {vehicle.kind}"
         hint = 'Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.'
         raise StageError("wrong_kind", what, where="configuration", hint=hint)
-    return Drive(speed=speed, steering=steering)
+    return {"speed": speed, "steering": steering}
 
 
 def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
@@ -526,7 +501,6 @@ def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] |
 
 _FEW_REPEATS = 0.05
 """Share of readings between two others above which their repeats are reported, as of poses."""
-_SIGNALS = ("left", "right", "speed", "steering", "sideways")
 
 
 def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
@@ -535,7 +509,7 @@ def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Findi
         return wheels, []
     times = wheels["t"].to_numpy()
     columns, periods, moved = {}, [0.0], np.zeros(times.size, dtype=bool)
-    for name in (name for name in _SIGNALS if name in wheels.columns):
+    for name in (name for name in SIGNALS if name in wheels.columns):
         values = wheels[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
         filled, period = interpolate_repeats(times, values)
         columns[f"{name}_aligned"] = pl.Series(filled).fill_nan(None)

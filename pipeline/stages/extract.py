@@ -30,7 +30,7 @@ from pipeline.sources import (
 from pipeline.stages import pose_topics, reading
 from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_pauses
 from pipeline.stages.drive import (
-    Drive,
+    SIGNALS,
     differentiate_angle,
     interpolate_readings,
     is_angle,
@@ -578,9 +578,10 @@ class Extraction:
             return pl.DataFrame()
         if source.form is DriveForm.JOINTS:
             columns, clock, order = self._require(source.signals[0].topic, held=held)
-            drive = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
+            drive, findings = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
+            self.findings += findings
             order = order[is_of_wheels(columns, drive)[order]]
-            drive = drive.take(order)
+            drive = {name: series[order] for name, series in drive.items()}
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
@@ -590,7 +591,6 @@ class Extraction:
             drive = read_pair(
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
             )
-        self.findings += drive.findings
         if section.late_s:
             stamp = stamp - round(section.late_s * 1e9)
         if not held and section.scale is not None:
@@ -600,20 +600,21 @@ class Extraction:
             )
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
+        names = [name for name in SIGNALS if held or not name.startswith("body")]
         values = {
-            name: empty
-            if (series := getattr(drive, name)) is None
-            else series * (1.0 if name == "steering" else section.scale or 1.0)
-            for name in Drive.list_signals()
-            if held or not name.startswith("body")
+            name: drive[name] * (1.0 if name == "steering" else section.scale or 1.0)
+            if name in drive
+            else empty
+            for name in names
         }
-        absent = [name for name in values if getattr(drive, name) is None]
         frame = pl.DataFrame(
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
         if section.ignore:
             frame = self._leave_out(frame, section.ignore, held=held)
-        return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
+        return frame.with_columns(
+            pl.lit(None, dtype=pl.Float64).alias(name) for name in names if name not in drive
+        )
 
     def _leave_out(self, frame: pl.DataFrame, spans: Sequence[OutageSection], *, held: bool) -> pl.DataFrame:
         """A drive without the readings that are none: rows of it, or values that would be held."""
@@ -622,7 +623,7 @@ class Extraction:
             inside = np.ones(seconds.size, dtype=bool)
             inside &= True if one.start_s is None else seconds >= one.start_s
             inside &= True if one.end_s is None else seconds < one.end_s
-            sides = {one.side, "sideways"} if one.side != "both" else set(Drive.list_signals())
+            sides = {one.side, "sideways"} if one.side != "both" else set(SIGNALS)
             frame = frame.with_columns(
                 pl.when(pl.Series(inside)).then(np.nan).otherwise(pl.col(name)).alias(name)
                 for name in sides.intersection(frame.columns)

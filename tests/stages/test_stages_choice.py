@@ -253,10 +253,10 @@ def test_velocities_in_another_unit_than_their_positions_are_converted(unit: str
     columns = TopicColumns(
         "/joint_states", 0, "sensor_msgs/msg/JointState", stamps, stamps, stamps, fields, ()
     )
-    drive = read_joints(columns, times, DriveSection(), husky)
-    assert drive.left == pytest.approx(speed)
-    assert [finding.id for finding in drive.findings] == (["unit_wrong"] if unit else [])
-    assert all(str(unit) in finding.text for finding in drive.findings)
+    drive, findings = read_joints(columns, times, DriveSection(), husky)
+    assert drive["left"] == pytest.approx(speed)
+    assert [finding.id for finding in findings] == (["unit_wrong"] if unit else [])
+    assert all(str(unit) in finding.text for finding in findings)
 
 
 def test_a_pose_whose_heading_does_not_follow_the_gyro_loses(tmp_path: Path, stamps: np.ndarray) -> None:
