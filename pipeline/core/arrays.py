@@ -308,7 +308,8 @@ def list_likelihoods(rest: Floats, scale: float | None = None) -> Floats:
     return made
 
 
-def weigh(rest: Floats) -> Floats:
-    """Weight of every residual in a regression, shape (n,)."""
-    made: Floats = (FREEDOM + 1.0) / (FREEDOM + (rest / find_scale(rest)) ** 2)
+def weigh(rest: Floats, scale: float | None = None) -> Floats:
+    """Weight of every residual in a regression, shape (n,); by default with the scale that they have."""
+    scale = find_scale(rest) if scale is None else scale
+    made: Floats = (FREEDOM + 1.0) / (FREEDOM + (rest / scale) ** 2)
     return made

@@ -7,6 +7,7 @@ is worth a change. The price of a change is the only threshold. Which pair disag
 what it was.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
@@ -387,15 +388,15 @@ def _fit(
     fits = []
     for friction in _FRICTIONS if is_command else _FRICTIONS[:1]:
         columns = blocks.list_columns(source, top, friction)
-        solved = [_solve(columns[rows], values[:, i]) for i in range(3)]
+        solved = [_solve(columns[rows], values[:, i], least) for i in range(3)]
         gains = np.column_stack([one[0] for one in solved])
         scale = np.hypot([find_scale(one[1]) for one in solved], least)
         fits.append(_Fit(top, friction, gains, target, columns @ gains, scale, spread, is_judged))
     return max(fits, key=lambda one: one.total)
 
 
-def _solve(columns: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Coefficients and residuals of a robust regression."""
+def _solve(columns: Floats, values: Floats, least: float) -> tuple[Floats, Floats]:
+    """Coefficients and residuals of a robust regression; below the least difference all fit alike."""
     size = np.sqrt(np.mean(columns**2, axis=0)) + _TINY
     design, weight = columns / size, np.ones(values.size)
     ridge = _TINY * values.size * np.eye(size.size)
@@ -404,7 +405,7 @@ def _solve(columns: Floats, values: Floats) -> tuple[Floats, Floats]:
         weighted = design * weight[:, None]
         gains = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ values)
         rest = values - design @ gains
-        weight = weigh(rest)
+        weight = weigh(rest, math.hypot(find_scale(rest), least))
     return gains / size, rest
 
 

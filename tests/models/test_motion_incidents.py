@@ -28,6 +28,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
+from pipeline.simulate.scenario import Commands
 from pipeline.stages import Finding
 from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import find_spans
@@ -179,6 +180,16 @@ def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
 def test_what_a_vehicle_always_does_is_no_incident(effects: dict[str, object]) -> None:
     for seed, program in enumerate(("drive_steps", "stop_and_go", "smooth")):
         made = simulate_run(make_scenario(effects, seed=seed, duration_s=180.0, program=Program(program)))
+        assert find(made) == []
+
+
+def test_two_long_circles_are_no_incident() -> None:
+    """Of four changes of the command it was not learned how the vehicle stops: an emergency stop."""
+    time = np.arange(0.0, 90.0, 0.05)
+    turn = np.select([time < 2.0, time < 42.0, time < 46.0, time < 86.0], [0.0, 0.4, 0.0, -0.4], 0.0)
+    commands = Commands(time, np.abs(turn), turn)
+    for effects in ({}, {"drive_lag": {"tau": 0.5}}, {"effective_track": {"k": 1.5}}):
+        made = simulate_run(make_scenario(effects, duration_s=90.0, played=commands))
         assert find(made) == []
 
 
