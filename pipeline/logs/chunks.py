@@ -104,32 +104,6 @@ def inflate_message(stored: bytes) -> Buffer:
         return inflate(stored, "zstd", max(zstandard.frame_content_size(stored), 0))
 
 
-def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
-    """Inflate the records of a chunk into a given buffer.
-
-    Args:
-        stored: compressed bytes.
-        compression: ``""``, ``"zstd"`` or ``"lz4"``.
-        target: buffer of the expected inflated size.
-
-    Raises:
-        InflateError: as ``inflate``.
-    """
-    size = len(target)
-    check_size(len(stored), compression, size)
-    if compression != "zstd" or size == 0:
-        target[:] = inflate(stored, compression, size)
-        return
-    with _naming_damage():
-        said = zstandard.frame_content_size(stored)
-        if said != size:
-            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
-        with _zstd().stream_reader(stored) as reader:
-            count = reader.readinto(target)
-    if count != size:
-        raise InflateError(f"{count} bytes came out in place of {size}")
-
-
 def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
     """Inflate up to ``size`` bytes that precede the first damage; damage raises no error."""
     if compression == "":
@@ -139,24 +113,6 @@ def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
         while len(start) < size and (part := reader.read(min(1 << 12, size - len(start)))):
             start += part
     return bytes(start)
-
-
-def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> Buffer:
-    """Inflate only the first ``needed`` bytes of a chunk of ``size`` bytes.
-
-    Raises:
-        InflateError: as ``inflate``; damage after the needed bytes is not detected.
-    """
-    check_size(len(stored), compression, size)
-    if compression == "":
-        return stored[:needed]
-    if compression != "zstd":
-        return inflate(stored, compression, size)[:needed]
-    with zstandard.ZstdDecompressor().stream_reader(stored) as reader, _naming_damage():
-        prefix = reader.read(needed)
-    if len(prefix) != needed:
-        raise InflateError(f"{len(prefix)} bytes came out in place of {needed}")
-    return prefix
 
 
 def holds_own_checksum(stored: Buffer, compression: str) -> bool:

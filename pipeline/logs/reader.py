@@ -378,7 +378,7 @@ def _read_part(
         return _Gathered(merged, losses, spans, spans * loaded.unchecked, loaded.index_damaged)
 
     spans = _spans_with(part, own)
-    return load_spans(source, spans, gather, threads=threads, wanted=own, file_holds=section.holds)
+    return load_spans(source, spans, gather, threads=threads, file_holds=section.holds)
 
 
 def _gather_bag(part: Part, messages: BagMessages) -> _Gathered:
@@ -410,7 +410,7 @@ def _find_repeated(
         def digest(_span: Span, loaded: Loaded, asked: Mapping[int, Ints] = asked) -> dict[int, list[Key]]:
             return digest_messages(loaded.chunk, loaded.messages, asked)
 
-        for keys_of in load_spans(source, _spans_with(part, own), digest, threads=threads, wanted=own):
+        for keys_of in load_spans(source, _spans_with(part, own), digest, threads=threads):
             for number, added in keys_of.items():
                 keys[part.numbers[number]] += added
     repeated: dict[int, Ints] = {}

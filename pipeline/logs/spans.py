@@ -3,10 +3,8 @@
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from itertools import chain
 from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
@@ -38,9 +36,6 @@ _MOST_STRETCHES: Final = 100
 """Maximum number of damaged ranges of a span that are reported individually; more are summarized."""
 
 _NEVER: Final = np.iinfo(np.int64).max
-
-_WORTHWHILE: Final = 0.8
-"""Maximum required fraction of a chunk for which partial inflation saves time."""
 
 
 class SpanKind(Enum):
@@ -124,18 +119,13 @@ def load_span(
     source: ByteSource,
     span: Span,
     file_holds: FileCheck = no_file_checksum,
-    wanted: AbstractSet[int] | None = None,
 ) -> Loaded:
     """Read, inflate and check one span.
-
-    A chunk without a checksum is inflated only up to the end of its last wanted message if its message
-    indexes state that position.
 
     Args:
         source: the file.
         span: the span.
         file_holds: called if a chunk's checksum differs; returns whether that of the whole file is valid.
-        wanted: numbers of the channels whose messages are needed, None for all.
     """
     if span.length + span.index_length > _MAX_SPAN:
         return _lost(span, "too_large", f"more than {_MAX_SPAN >> 20} MiB at once are not read")
@@ -151,7 +141,7 @@ def load_span(
         span = replace(span, start_ns=head.start_ns, end_ns=head.end_ns)
     stored = blob[head.body : head.body + head.compressed_size]
     try:
-        return _load_chunk(span, blob, head, losses, file_holds, wanted)
+        return _load_chunk(span, blob, head, losses, file_holds)
     except _SpanError as error:
         if not _is_unwritten(source, span, stored):
             return _lost(span, error.kind, error.reason)
@@ -165,7 +155,6 @@ def _load_chunk(
     head: rec.ChunkHead,
     losses: list[Loss],
     file_holds: FileCheck,
-    wanted: AbstractSet[int] | None,
 ) -> Loaded:
     """Inflate and check a chunk whose header is parsed; ``losses`` are those of its header."""
     stored = blob[head.body : head.body + head.compressed_size]
@@ -173,10 +162,6 @@ def _load_chunk(
         return _load_start(span, head, stored, "the file ends inside it")
     entries = _read_entries(blob[span.length :])
     unchecked = head.crc == 0 and not chunks.holds_own_checksum(stored, head.compression)
-    if unchecked and entries and wanted:
-        needed = _needed_size(span, entries, wanted)
-        if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
-            return _load_prefix(span, head, stored, entries, needed)
     chunk = _inflate_checked(span, head, stored, file_holds, losses)
     messages = locate_messages(chunk, entries, len(stored))
     losses += _damage_losses(span, messages, len(chunk))
@@ -184,62 +169,6 @@ def _load_chunk(
         losses += _compare_times(span, head, messages)
     index_damaged = span.index_length > 0 and messages.walked and messages.start.size > 0
     return Loaded(chunk, messages, losses, unchecked=unchecked, index_damaged=index_damaged)
-
-
-def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loaded | None:
-    """Read adjacent chunks as one: their concatenated records are equivalent to one chunk.
-
-    Args:
-        source: the file.
-        spans: chunks that are adjacent in the file.
-        size: total inflated size as stated in the summary [bytes].
-
-    Returns:
-        All their messages; None on any inconsistency: each chunk must then be read individually.
-    """
-    start = spans[0].offset
-    blob = memoryview(
-        source.read_at(start, spans[-1].offset + spans[-1].length + spans[-1].index_length - start)
-    )
-    chunk = np.empty(size, dtype=np.uint8).data
-    joined: list[Entries] = []
-    position = 0
-    for span in spans:
-        part = blob[span.offset - start : span.offset - start + span.length + span.index_length]
-        try:
-            head, losses = _open_chunk(span, part)
-            entries = _read_entries(part[span.length :])
-            target = chunk[position : position + head.uncompressed_size]
-            chunks.inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
-        except (_SpanError, chunks.InflateError, ValueError):
-            return None
-        if losses or entries is None or head.crc == 0 or zlib.crc32(target) != head.crc:
-            return None
-        shift = np.array([0, position], dtype=np.uint64)
-        joined += [(channel, entry + shift) for channel, entry in entries]
-        position += head.uncompressed_size
-    messages = locate_messages(chunk, joined, len(blob))
-    return None if messages.walked or messages.damage or position != size else Loaded(chunk, messages)
-
-
-def _needed_size(span: Span, entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
-    """Size of the chunk up to the end of the last wanted message [bytes], None if it is not certain."""
-    if set(span.channels or ()) != {number for number, _ in entries}:
-        return None
-    last = max((int(e[:, 1].max()) for c, e in entries if c in wanted and e.size), default=-1)
-    behind = [int(later.min()) for _, e in entries if (later := e[e[:, 1] > last, 1]).size]
-    return min(behind, default=None)
-
-
-def _load_prefix(
-    span: Span, head: rec.ChunkHead, stored: Buffer, entries: list[Entries], needed: int
-) -> Loaded:
-    try:
-        chunk = chunks.inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
-    except chunks.InflateError as error:
-        raise _SpanError("damaged_chunk", f"it cannot be decompressed: {error}") from None
-    messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries], len(stored))
-    return Loaded(chunk, messages, _damage_losses(span, messages, len(chunk)), unchecked=True)
 
 
 def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]]:
@@ -409,9 +338,6 @@ def _lost(span: Span, kind: str, reason: str) -> Loaded:
 
 Result = TypeVar("Result")
 
-_TOGETHER: Final = 6 << 20
-"""Maximum total inflated size of adjacent chunks read together [bytes], to reduce the overhead of Python."""
-
 _IN_FLIGHT: Final = 1 << 30
 """Maximum inflated size in memory over all threads [bytes], unless a single chunk is larger."""
 
@@ -424,7 +350,6 @@ def load_spans(
     use: Callable[[Span, Loaded], Result],
     *,
     threads: int,
-    wanted: AbstractSet[int] | None = None,
     file_holds: FileCheck = no_file_checksum,
 ) -> Iterator[Result]:
     """Read spans in order.
@@ -432,47 +357,20 @@ def load_spans(
     Args:
         source: the file.
         spans: the spans.
-        use: processes a loaded span, on the reading threads so that the chunk is freed early; if only some
-            channels are wanted, undamaged adjacent chunks are passed as one, with the first span.
+        use: processes a loaded span, on the reading threads so that the chunk is freed early.
         threads: number of spans that are read at once.
-        wanted: numbers of the channels whose messages are needed, None for all.
         file_holds: called if a chunk's checksum differs; returns whether that of the whole file is valid.
 
     Yields:
         The results of ``use``.
     """
 
-    def read(group: list[Span]) -> list[Result]:
-        size = sum(span.inflated for span in group)
-        together = load_together(source, group, size) if len(group) > 1 else None
-        if together is not None:
-            return [use(group[0], together)]
-        return [use(span, load_span(source, span, file_holds, wanted)) for span in group]
+    def read(span: Span) -> Result:
+        return use(span, load_span(source, span, file_holds))
 
-    groups = _group_neighbours(spans) if wanted is not None else [[span] for span in spans]
-    yield from chain.from_iterable(map_in_order(read, groups, threads, weigh=_weigh, limit=_IN_FLIGHT))
-
-
-def _weigh(group: list[Span]) -> int:
-    """Memory of a group [bytes]."""
-    return sum(max(span.inflated, span.length) for span in group)
-
-
-def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
-    """Groups of adjacent chunks, of at most `_TOGETHER` bytes unless a single chunk is larger."""
-    groups: list[list[Span]] = []
-    size = 0
-    for span in spans:
-        inflated = _TOGETHER if span.stored_as is None else span.inflated
-        last = groups[-1][-1] if groups else None
-        behind = last is not None and last.offset + last.length + last.index_length == span.offset
-        size += inflated
-        if behind and size <= _TOGETHER:
-            groups[-1].append(span)
-        else:
-            groups.append([span])
-            size = inflated
-    return groups
+    yield from map_in_order(
+        read, spans, threads, weigh=lambda span: max(span.inflated, span.length), limit=_IN_FLIGHT
+    )
 
 
 def checksum_holds(source: ByteSource, end: int, crc: int) -> bool:
