@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -125,6 +126,16 @@ def summarize(
         undecided = take_judged(undecided, judgement)
     # What the wheels leave is a matter of the ground, wherever the model starts.
     ground = judgements.get(body.path, judgement)
+    suggestion = None
+    if ground is not None and body.formula is not None:
+        suggestion = residual_structure.suggest(ground, body.formula, judgement or ground)
+    if ground is not None and suggestion is not None:
+        # What a formula leaves is nearer to what nothing explains.
+        own = body.path if body.path in judgements else source.value
+        ground = judgements[own] = dataclasses.replace(ground, suggested=suggestion.ground)
+        if judgement is not None:
+            judgement = dataclasses.replace(judgement, suggested=suggestion.leading)
+            judgements[source.value] = judgement
     learned = None if ground is None else learn_beyond(ground)
     region = _find_region(context, judgement)
     windows, start = context.problem.whole, body.outcome.start.state
@@ -148,7 +159,9 @@ def summarize(
         ),
         unobservable_why=unobservable,
         detectable=tuple(one for path in paths for one in path.detectable if one.id not in hidden),
-        unexplained=_find_unexplained(paths, ground, judgement or ground, learned, region),
+        unexplained=_find_unexplained(paths, learned, region)
+        if suggestion is None
+        else suggestion.unexplained,
         findings=(
             *note_cut(body.search.budget),
             *(() if judgement is None else find_change(judgement)),
@@ -176,18 +189,9 @@ def summarize(
 
 
 def _find_unexplained(
-    paths: Sequence[Explored],
-    ground: Judgement | None,
-    leading: Judgement | None,
-    learned: LearnedStep | None,
-    region: Region | None,
+    paths: Sequence[Explored], learned: LearnedStep | None, region: Region | None
 ) -> Unexplained | None:
-    """What no effect explains: a formula, else a learned term, what lasts, or where nearly all of it is."""
-    formula = paths[0].formula
-    if ground is not None and leading is not None and formula is not None:
-        suggested = residual_structure.suggest(ground, formula, leading)
-        if suggested is not None:
-            return suggested
+    """What no effect and no formula explains: a learned term, what lasts, or where nearly all of it is."""
     if learned is not None:
         described = residual_structure.describe_learned(learned, paths[0].path)
         if described is not None:

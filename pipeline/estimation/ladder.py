@@ -210,6 +210,7 @@ class Judgement:
         estimates: its parameters with intervals.
         per_run: labels with one value per run.
         learned: the same with a learned term on top; None without one.
+        suggested: the effects with a suggested formula; None without one.
     """
 
     problem: Problem
@@ -217,6 +218,7 @@ class Judgement:
     estimates: Estimates
     per_run: tuple[str, ...] = ()
     learned: LadderStep | None = None
+    suggested: LadderStep | None = None
 
     @property
     def whole(self) -> LadderStep:
@@ -241,8 +243,8 @@ class Judgement:
 
     @cached_property
     def floor(self) -> Errors:
-        """The noise floor of the runs, by what the physics leaves."""
-        return estimate_floor(self.problem, self.physics.fitted.state)
+        """The noise floor of the runs, by what the physics leaves, and a suggested formula."""
+        return estimate_floor(self.problem, (self.suggested or self.physics).fitted.state)
 
 
 def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -97,8 +97,23 @@ def _list_terms(fit: PartFit) -> list[FormulaEffect]:
     return [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
 
 
-def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) -> Unexplained | None:
-    """A formula as a suggestion, with the errors of the model with it; None where it does not lower them.
+@dataclass(frozen=True)
+class Suggestion:
+    """A formula that no effect of the catalogue is.
+
+    Attributes:
+        unexplained: what is said of it.
+        ground: the model with it, from the input that it was found on.
+        leading: the same from the input that the diagnosis speaks of; None where it lowers no error there.
+    """
+
+    unexplained: Unexplained
+    ground: LadderStep
+    leading: LadderStep | None
+
+
+def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) -> Suggestion | None:
+    """A formula as a suggestion, with the model with it; None where it does not lower the errors.
 
     Args:
         judgement: of the model without it, from what it was found on.
@@ -122,7 +137,7 @@ def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) ->
             said = judge_whole(leading.problem, leading.fitted.model + formula)
             # What the wheels show may be too little from commands to promise anything of them.
             said = said if lowers_errors(leading.whole.errors, said.errors) else None
-        return Unexplained(
+        unexplained = Unexplained(
             "formula",
             float(falls.max()),
             channel,
@@ -131,6 +146,7 @@ def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) ->
             formula=format_effect(fitted),
             with_formula=None if said is None else read_result(errors_as_json(said.errors), Errors),
         )
+        return Suggestion(unexplained, step, said)
     return None
 
 

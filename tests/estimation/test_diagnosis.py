@@ -236,6 +236,9 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     assert left.with_formula == read_result(errors_as_json(whole.errors), Errors)
     before, after = (one.velocity_rms[0] for one in (run.ladder[-1], left.with_formula))
     assert after < 0.7 * before  # type: ignore[operator]
+    assert run.noise_floor is not None
+    assert left.with_formula is not None
+    assert run.noise_floor.t_mrmse_m < 1.05 * left.with_formula.t_mrmse_m, "one floor with and without it"
     assert "would remain over 2 s" in describe([run])
 
 
@@ -253,7 +256,8 @@ def test_a_wheel_out_of_round_is_told_by_what_it_has_turned(tmp_path: Path) -> N
     assert would is not None
     assert floor is not None
     assert floor.r_mrmse_rad < 1.05 * would.r_mrmse_rad < 0.9 * run.ladder[-1].r_mrmse_rad
-    assert "at the noise floor" not in describe([run]).split("a suggested term")[0]
+    assert floor.t_mrmse_m < 1.05 * would.t_mrmse_m
+    assert "at the noise floor in heading" not in describe([run])
 
 
 @pytest.mark.long
