@@ -90,8 +90,10 @@ def _lack_estimates(compared: ComparedRuns) -> SlipError:
     return lack_runs("nothing_to_fit", what, compared.store.root, hint, compared.notes)
 
 
-def _find_runs(store: Store, optional: Sequence[str] = ()) -> ComparedRuns:
-    return find_material(store, ("vehicle",), trusted_only=True, tables=_TABLES, optional=optional)
+def _find_runs(store: Store, optional: Sequence[str] = (), vehicle: str = "") -> ComparedRuns:
+    return find_material(
+        store, ("vehicle",), trusted_only=True, tables=_TABLES, optional=optional, vehicle=vehicle
+    )
 
 
 def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
@@ -300,7 +302,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         forecast: forecast of the vehicle on the terrain.
         seed: seed of the draws.
     """
-    compared = _find_runs(store, tuple(TABLE_COLUMNS))
+    compared = _find_runs(store, tuple(TABLE_COLUMNS), forecast.vehicle)
     runs = _load_runs(compared, forecast)
     rng = np.random.default_rng(seed)
     paces = np.log([max(run.pace, 1e-6) for run in runs])

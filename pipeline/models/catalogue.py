@@ -181,6 +181,8 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
     if name in known:
         return known[name]
     hint = f"{guess_names(name, known)}`slip effects` lists them all."
+    if name.endswith(".py"):
+        hint = f'Name its file above [vehicle] of the model file, effects = ["{name}"], and its id here.'
     raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
 
 

@@ -106,7 +106,9 @@ def format_number(value: float | None, *, digits: int = 3) -> str:
         return MISSING
     if value == 0.0:
         return "0"
-    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    # Of 0.9999 the first of three digits is that of 1.00.
+    first = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    places = max(0, digits - 1 - first)
     return f"{value:z,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
 
 

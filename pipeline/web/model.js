@@ -211,6 +211,6 @@ const buildFormula = (pane) => {
     event.preventDefault();
     if (await pane.act("formula", { effect: parts.effect.value.trim(), channel: channel.value, formula: parts.formula.value, parameters: parts.parameters.value })) pane.tryAll();
   } }, parts.effect, channel, parts.formula, parts.parameters, h("button", { type: "submit" }, "Add formula"),
-  h("p", { class: "quiet" }, "Signals: v0, s0 (lateral), w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
+  h("p", { class: "quiet" }, "Signals: v0, s0 (lateral), w0, f_x, f_w, left, right, steering, roll, pitch, yaw, x, y, each with _rate; t, left_angle, right_angle. Units are checked."));
   return h("details", { class: "formula" }, h("summary", {}, "Write a formula"), form);
 };

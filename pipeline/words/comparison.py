@@ -47,7 +47,8 @@ class Line:
     Attributes:
         family: vehicles that it is about.
         input: input u.
-        driving: `as driven`, `at equal driving`, `as published`, `the difference`, or `to know more`.
+        driving: `as driven`, `at equal driving`, `the ground alone`, `as published`, `the difference`, or
+            `to know more`.
         text: the sentence, without these.
     """
 
@@ -58,7 +59,7 @@ class Line:
 
 
 def list_lines(answer: Answer) -> list[Line]:
-    """The answer, at most four lines for each vehicle and input."""
+    """The answer, at most five lines for each vehicle and input."""
     lines = []
     for family, datasets in answer.families.items():
         labels = shorten_names(family, datasets)
@@ -79,6 +80,10 @@ def list_lines(answer: Answer) -> list[Line]:
                 )
                 continue
             lines.append(Line(family, name, "at equal driving", _describe_equal(equal, labels)))
+            alone = _take(answer.find_view("measured", equal=True), datasets)
+            if name == answer.input != "measured" and alone is not None and _find_extremes(alone):
+                text = f"{_describe_equal(alone, labels)} (from wheel encoders)"
+                lines.append(Line(family, name, "the ground alone", text))
             if text := _split_difference(driven, equal, extremes, labels):
                 carrier = answer.carriers.get((name, frozenset(extremes)), "")
                 text += f"; as driven it is carried by {carrier}" * bool(carrier)
@@ -126,7 +131,7 @@ class _Part:
                 f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs: "
                 "more runs are needed to compare the grounds"
             )
-        return f"{decided.count(DIFFERENT)} of {len(verdicts)} pairs significant"
+        return f"{decided.count(DIFFERENT) or 'none'} of {format_count(len(verdicts), 'pair')} significant"
 
 
 def orient_ratio(row: Mapping[str, object], over: str) -> Ratios | None:
@@ -300,8 +305,8 @@ def _split_difference(
         return f"{start}, and all of it is the driving ({common})"
     sure = ", not significant" if judge_pair(ground[1]) == ALIKE else ""
     return (
-        f"{start}: a factor {format_two(driving)} is the driving, {format_two(ground_factor)} the "
-        f"ground{sure} ({common})"
+        f"{start}: a factor {format_two(driving)} is the driving, {format_two(ground_factor)} remains at equal "
+        f"driving{sure} ({common})"
     )
 
 

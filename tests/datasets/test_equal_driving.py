@@ -242,8 +242,10 @@ def test_both_questions_are_answered_on_both_inputs_within_a_vehicle(answer: Ans
     kinds = ("as driven", "at equal driving", "the difference")
     assert [(line.family, line.input, line.driving) for line in lines] == [
         *(("husky", name, "as driven") for name in FACTORS),
-        *(("warthog", name, kind) for name in FACTORS for kind in kinds),
+        *(("warthog", "command", kind) for kind in (*kinds[:2], "the ground alone", kinds[2])),
+        *(("warthog", "measured", kind) for kind in kinds),
     ]
+    assert lines[4].text == f"{lines[7].text} (from wheel encoders)"
     assert lines[0].text.endswith(" m/s")
     assert lines[2].text.startswith("ice (1.5 m/s) hardest, ")
     assert "; 2 of 3 pairs significant" in lines[2].text

@@ -68,6 +68,7 @@ WORDS: list[tuple[str, str]] = [
     ("model new-effect wind.toml", r"side_wind\.py"),
     ("model new-effect drive_lag.py", "an effect is called so already"),
     ("model add missing.toml drive_lag --on field/wide", "missing.toml"),
+    ("model add husky.toml mine.py --on field/wide", r"Name its file above \[vehicle\] of the model file"),
     ("model add husky.toml nothing --on field/wide", "no effect is called 'nothing'"),
     ("model add husky.toml effective_track --on text.mcap", "text.mcap"),
     ("model add husky.toml drive_lag --on", "--on names no run"),

@@ -12,6 +12,7 @@ from report_synthesis import list_places, make_report
 
 from pipeline import report
 from pipeline.report import (
+    format_number,
     render_template,
     show_text,
 )
@@ -236,3 +237,10 @@ def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:
         "held_poses": "x",
     }
     assert outline_of(render_report(RunReport(odd, {}))).open == []
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.99997, "1.00"), (9.996, "10.0"), (0.2414, "0.241"), (1234.5, "1,234"), (0.0, "0")]
+)
+def test_a_number_that_is_rounded_up_has_no_digit_too_many(value: float, text: str) -> None:
+    assert format_number(value) == text
