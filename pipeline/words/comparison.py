@@ -305,8 +305,8 @@ def _split_difference(
         return f"{start}, and all of it is the driving ({common})"
     sure = ", not significant" if judge_pair(ground[1]) == ALIKE else ""
     return (
-        f"{start}: a factor {format_two(driving)} is the driving, {format_two(ground_factor)} remains at equal "
-        f"driving{sure} ({common})"
+        f"{start}: a factor {format_two(driving)} is the driving, {format_two(ground_factor)} remains at "
+        f"equal driving{sure} ({common})"
     )
 
 
