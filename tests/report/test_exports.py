@@ -1,6 +1,7 @@
 """Exports: read back by the readers that others wrote, and by people's viewers' rules."""
 
 import json
+import re
 import runpy
 import shutil
 import subprocess
@@ -232,6 +233,26 @@ def test_the_foxglove_layout_is_of_the_shape_that_its_viewers_save(
     low, high = places.min(axis=0), places.max(axis=0)
     assert np.allclose(camera["targetOffset"][:2], (low + high) / 2.0, atol=0.01)
     assert camera["distance"] >= (high - low).max()
+
+
+def test_the_plotjuggler_layout_is_what_its_loader_reads(source: ExportSource, tmp_path: Path) -> None:
+    # What restoreSplitter and xmlLoadState of PlotJuggler 3 do: an area is a child of the splitter,
+    # as many sizes as areas (it indexes them unchecked); MainWindow zooms to the data after loading.
+    root = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml")).getroot()  # noqa: S314 - our own
+    widget = root.find("tabbed_widget")
+    assert widget is not None
+    assert widget.get("parent") == "main_window"
+    (splitter,) = root.iterfind("tabbed_widget/Tab/Container/DockSplitter")
+    assert splitter.get("orientation") in {"|", "-"}
+    sizes = [float(size) for size in splitter.attrib["sizes"].split(";")]
+    assert len(sizes) == len(splitter) == int(splitter.attrib["count"])
+    assert sum(sizes) == pytest.approx(1.0)
+    for area in splitter:
+        assert area.tag == "DockArea"
+        (plot,) = area
+        assert (plot.tag, plot.get("mode"), plot.get("style")) == ("plot", "TimeSeries", "Lines")
+        assert {curve.tag for curve in plot} == {"curve"}
+        assert all(re.fullmatch("#[0-9a-f]{6}", curve.attrib["color"]) for curve in plot)
 
 
 @pytest.mark.parametrize(
