@@ -142,7 +142,6 @@ class Cursor:
         base: where each row's alignment starts, int64, shape (n,).
         limit: length of each row from its base [bytes], int64, shape (n,).
         rows: index of each row, reported if it does not fit, int64, shape (n,).
-        stride: distance between adjacent bases if it is constant, else None.
         dialect: layout of the rows.
         position: offset from the base [bytes]; one number, or int64 of shape (n,).
     """
@@ -151,7 +150,6 @@ class Cursor:
     base: Ints
     limit: Ints
     rows: Ints
-    stride: int | None
     dialect: Dialect
     position: int | Ints = 0
 
@@ -159,7 +157,7 @@ class Cursor:
         """Cursor for some of the rows."""
         position = self.position if isinstance(self.position, int) else self.position[chosen]
         return Cursor(
-            self.data, self.base[chosen], self.limit[chosen], self.rows[chosen], None, self.dialect, position
+            self.data, self.base[chosen], self.limit[chosen], self.rows[chosen], self.dialect, position
         )
 
     def align(self, size: int) -> None:
@@ -198,7 +196,7 @@ class Cursor:
             return np.empty((self.base.size, 0), dtype=NUMBER_TYPES[kind])
         self.align(size)
         self.require(size * count)
-        values = self._peek(self._stored_type(kind), count)
+        values = self._gather(self._stored_type(kind), count, self.base + self.position)
         self.advance(size * count)
         return values.astype(np.bool_) if kind == "bool" else values
 
@@ -256,23 +254,15 @@ class Cursor:
         return codes
 
     def _check_terminators(self, lengths: int | Ints) -> None:
-        if isinstance(lengths, int):
-            if lengths > 0:
-                last = self._peek(np.dtype("u1"), 1, shift=lengths - 1)[:, 0]
-                self.reject(last != 0)
-            return
-        some = np.flatnonzero(lengths > 0)
-        position = self.position if isinstance(self.position, int) else self.position[some]
-        wrong = np.zeros(self.base.size, dtype=np.bool_)
-        wrong[some] = self.data[self.base[some] + position + lengths[some] - 1] != 0
-        self.reject(wrong)
+        last = self.base + self.position + lengths - 1
+        self.reject((lengths > np.zeros_like(last)) & (self.data[last] != 0))
 
     def _code_equal(self, length: int, vocabulary: Vocabulary) -> NDArray[np.int32]:
         if length == 0:
             return np.full(self.base.size, vocabulary.code(b""), dtype=np.int32)
         if length >= _LONG_TEXT:
             return self._code_unequal(np.full(self.base.size, length, dtype=np.int64), vocabulary)
-        texts = self._peek(np.dtype("u1"), length)
+        texts = self._gather(np.dtype("u1"), length, self.base + self.position)
         starts = np.flatnonzero(np.r_[True, (texts[1:] != texts[:-1]).any(axis=1)])
         codes = [vocabulary.code(texts[start].tobytes()) for start in starts.tolist()]
         runs = np.diff(np.r_[starts, texts.shape[0]])
@@ -289,18 +279,6 @@ class Cursor:
 
     def _stored_type(self, kind: str) -> np.dtype[np.generic]:
         return NUMBER_TYPES["uint8" if kind == "bool" else kind].newbyteorder(self.dialect.order)
-
-    def _peek(self, dtype: np.dtype[np.generic], count: int, *, shift: int = 0) -> NDArray[np.generic]:
-        if self.stride is None or not isinstance(self.position, int):
-            return self._gather(dtype, count, self.base + (self.position + shift))
-        strided: NDArray[np.generic] = np.ndarray(
-            (self.base.size, count),
-            dtype=dtype,
-            buffer=self.data.data,
-            offset=int(self.base[0]) + self.position + shift,
-            strides=(self.stride, dtype.itemsize),
-        )
-        return strided
 
     def _gather(self, dtype: np.dtype[np.generic], count: int, position: Ints) -> NDArray[np.generic]:
         size = dtype.itemsize * count

@@ -21,11 +21,10 @@ from pipeline.logs.columns import (
     STAMPS,
     Block,
     Column,
-    Group,
     Payloads,
     Ragged,
     RaggedStrings,
-    join_groups,
+    join_blocks,
     select_leaves,
 )
 from pipeline.logs.decode import ColumnParts, Decoder, plan_fields, wanted_leaves
@@ -121,11 +120,8 @@ class StructuredDecoder:
                 self._reject("undecodable", f"0x{kind:04x} is not an encapsulation", ids, block, chosen)
 
     def _decode_alike(self, ids: Ints, block: Block, dialect: Dialect, chosen: Ints) -> None:
-        base, limit = block.start + dialect.header, block.size - dialect.header
-        stride = block.stride
-        if chosen.size < ids.size:
-            base, limit, stride = base[chosen], limit[chosen], None
-        pieces, whole = self._decoder.decode(Cursor(block.data, base, limit, chosen, stride, dialect))
+        base, limit = block.start[chosen] + dialect.header, block.size[chosen] - dialect.header
+        pieces, whole = self._decoder.decode(Cursor(block.data, base, limit, chosen, dialect))
         self._ids.append(ids[whole])
         for path, piece in pieces.items():
             self._parts[path].add(piece)
@@ -160,26 +156,25 @@ class ChannelBuffer:
     decoder: StructuredDecoder | ObjectDecoder
     _log: list[Ints] = field(default_factory=list)
     _publish: list[Ints] = field(default_factory=list)
-    _pending: list[tuple[int, Group]] = field(default_factory=list)
+    _pending: list[Block] = field(default_factory=list)
     _pending_bytes: int = 0
+    _decoded: int = 0
     count: int = 0
 
     def add(self, payloads: Payloads) -> None:
         """Add the messages of the next span."""
         self._log.append(payloads.log_time)
         self._publish.append(payloads.publish_time)
-        for group in payloads.groups:
-            self._pending.append((self.count, group))
-            self._pending_bytes += group.data.size
+        self._pending.append(payloads.block)
+        self._pending_bytes += payloads.block.data.size
         self.count += payloads.log_time.size
         if self._pending_bytes > _ENOUGH:
             self._flush()
 
     def _flush(self) -> None:
-        for ids, block in join_groups(self._pending):
-            self.decoder.decode(ids, block)
-        self._pending = []
-        self._pending_bytes = 0
+        if self._pending:
+            self.decoder.decode(np.arange(self._decoded, self.count), join_blocks(self._pending))
+        self._pending, self._pending_bytes, self._decoded = [], 0, self.count
 
     def times(self) -> tuple[Ints, Ints]:
         """Log and publish times [ns] of all messages, in file order."""

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Floats, Ints, group_rows
+from pipeline.core import Flags, Floats, Ints
 from pipeline.logs.chunks import MESSAGE_OVERHEAD, Messages
 from pipeline.logs.records import Buffer, LogError
 
@@ -214,31 +214,19 @@ def _element(column: Column, number: int) -> Column:
     return column
 
 
-IN_PLACE: Final = 1 << 13
-"""Minimum size of payloads that are decoded in place instead of copied [bytes]."""
-
-
-_COMMON: Final = 16
-"""Minimum number of rows of one length; payloads of rarer lengths are decoded together."""
-
-
 @dataclass(slots=True, eq=False)
-class Group:
-    """Payloads of equal length of one channel in one span.
+class Block:
+    """Payloads in one buffer, ready to be decoded.
 
     Attributes:
-        count: number of payloads.
-        size: size of each payload [bytes].
-        data: uint8; the concatenated payloads, or the whole chunk if ``start`` is given.
-        rows: their indices among the span's messages of the channel, None if they are all of them.
-        start: start of each payload in ``data``, None if they are concatenated.
+        data: uint8, shape (m,).
+        start: start of each payload in ``data``, int64, shape (n,).
+        size: size of each payload [bytes], int64, shape (n,).
     """
 
-    count: int
-    size: int
     data: NDArray[np.uint8]
-    rows: Ints | None = None
-    start: Ints | None = None
+    start: Ints
+    size: Ints
 
 
 @dataclass(slots=True, eq=False)
@@ -248,29 +236,12 @@ class Payloads:
     Attributes:
         log_time: [ns], int64, shape (n,), in file order.
         publish_time: [ns], int64.
-        groups: payloads by length.
+        block: their payloads.
     """
 
     log_time: Ints
     publish_time: Ints
-    groups: list[Group]
-
-
-@dataclass(slots=True, eq=False)
-class Block:
-    """Payloads in one buffer, ready to be decoded.
-
-    Attributes:
-        data: uint8, shape (m,).
-        start: start of each payload in ``data``, int64, shape (n,).
-        size: size of each payload [bytes], int64, shape (n,).
-        stride: distance of adjacent payloads if they are concatenated and of equal length, else None.
-    """
-
-    data: NDArray[np.uint8]
-    start: Ints
-    size: Ints
-    stride: int | None
+    block: Block
 
 
 def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -> dict[int, Payloads]:
@@ -281,83 +252,34 @@ def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -
         messages: positions of its messages.
         numbers: channel numbers.
     """
-    data = np.frombuffer(chunk, dtype=np.uint8)
-    order = np.argsort(messages.channel, kind="stable")
-    channel, start, size = messages.channel[order], messages.start[order], messages.size[order]
-    log, publish = messages.log_time[order], messages.publish_time[order]
-    wanted = sorted(numbers)
-    low = channel.searchsorted(wanted).tolist()
-    high = channel.searchsorted(wanted, side="right").tolist()
-    return {
-        number: Payloads(log[a:b], publish[a:b], _group_by_size(data, start[a:b], size[a:b]))
-        for number, a, b in zip(wanted, low, high, strict=True)
-        if b > a
-    }
+    view, payloads = memoryview(chunk), {}
+    for number in numbers:
+        rows = np.flatnonzero(messages.channel == number)
+        if rows.size:
+            start, size = messages.start[rows], messages.size[rows]
+            spans = zip(start.tolist(), (start + size).tolist(), strict=True)
+            payloads[number] = join_payloads(
+                messages.log_time[rows], messages.publish_time[rows], [view[low:high] for low, high in spans]
+            )
+    return payloads
 
 
-def join_payloads(log_time: list[int], payloads: list[Buffer]) -> Payloads:
-    """Join messages of one channel that were read one by one; their log and publish times [ns] are equal."""
-    time = np.array(log_time, dtype=np.int64)
+def join_payloads(log_time: Ints, publish_time: Ints, payloads: Sequence[Buffer]) -> Payloads:
+    """Copy messages of one channel, with their log and publish times [ns], into one block."""
     size = np.array([len(payload) for payload in payloads], dtype=np.int64)
-    data = np.frombuffer(b"".join(payloads) or bytes(1), dtype=np.uint8)
-    return Payloads(time, time, _group_by_size(data, np.cumsum(size) - size, size))
+    data = np.frombuffer(b"".join(payloads), dtype=np.uint8)
+    return Payloads(log_time, publish_time, Block(data, np.cumsum(size) - size, size))
 
 
-def _group_by_size(data: NDArray[np.uint8], start: Ints, size: Ints) -> list[Group]:
-    first = int(size[0])
-    if size.min() == size.max():
-        return [_gather(data, None, start, first)]
-    return [_gather(data, rows, start[rows], int(size[rows[0]])) for rows in group_rows(size)]
-
-
-def _gather(data: NDArray[np.uint8], rows: Ints | None, start: Ints, size: int) -> Group:
-    if size >= IN_PLACE:
-        return Group(start.size, size, data, rows, start)
-    if size == 0:
-        return Group(start.size, 0, data[:0], rows)
-    window: NDArray[np.void] = np.ndarray((data.size - size + 1,), f"V{size}", data, strides=(1,))
-    return Group(start.size, size, window[start].view(np.uint8), rows)
-
-
-def join_groups(groups: list[tuple[int, Group]]) -> list[tuple[Ints, Block]]:
-    """Join groups for decoding: one block per length, rare lengths in one mixed block.
-
-    Args:
-        groups: groups, each with the index of the span's first message in the channel.
-
-    Returns:
-        Blocks, each with the indices of its rows in the channel.
-    """
-    by_size: dict[int, list[tuple[int, Group]]] = {}
-    joined: list[tuple[Ints, Block]] = []
-    for first, group in groups:
-        if group.start is None:
-            by_size.setdefault(group.size, []).append((first, group))
-        else:
-            size = np.full(group.count, group.size, dtype=np.int64)
-            joined.append((_numbers(first, group), Block(group.data, group.start, size, None)))
-    rare: list[tuple[int, Group]] = []
-    for same in by_size.values():
-        if sum(group.count for _, group in same) < _COMMON:
-            rare += same
-        else:
-            joined.append(_join(same))
-    if rare:
-        joined.append(_join(rare))
-    return joined
-
-
-def _join(groups: list[tuple[int, Group]]) -> tuple[Ints, Block]:
-    ids = np.concatenate([_numbers(first, group) for first, group in groups])
-    data = np.concatenate([group.data for _, group in groups])
-    each = [group.size for _, group in groups]
-    size = np.repeat(each, [group.count for _, group in groups])
-    start = np.cumsum(size) - size
-    return ids, Block(data, start, size, each[0] if min(each) == max(each) and each[0] else None)
-
-
-def _numbers(first: int, group: Group) -> Ints:
-    return first + (np.arange(group.count) if group.rows is None else group.rows)
+def join_blocks(blocks: Sequence[Block]) -> Block:
+    """Blocks in order as one."""
+    sizes = [block.data.size for block in blocks]
+    starts = [block.start + first for block, first in zip(blocks, np.cumsum(sizes) - sizes, strict=True)]
+    return Block(
+        np.concatenate([block.data for block in blocks]),
+        np.concatenate(starts),
+        np.concatenate([block.size for block in blocks]),
+    )
 
 
 # Messages that occur more than once in a recording: duplicated chunks, ranges copied into the file.

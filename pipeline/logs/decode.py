@@ -177,7 +177,7 @@ class Decoder:
             below: Pieces = {}
             if base.size:
                 limit = np.full(base.size, layout.size, dtype=np.int64)
-                self._read(plan, Cursor(cursor.data, base, limit, rows, None, cursor.dialect), prefix, below)
+                self._read(plan, Cursor(cursor.data, base, limit, rows, cursor.dialect), prefix, below)
             for path, leaf in wanted_leaves(plan, prefix):
                 piece = below.get(path, Piece(leaf.nothing))
                 inner = piece.counts

@@ -28,7 +28,7 @@ from mcap.records import Channel, Schema
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import OVER_BUDGET, Catalog
 from pipeline.logs.chunks import Allowance, BudgetError, InflateError, inflate_message, list_decompressors
-from pipeline.logs.columns import Group, Payloads, join_payloads
+from pipeline.logs.columns import Block, Payloads, join_blocks, join_payloads
 from pipeline.logs.records import Buffer, ByteSource, LogError, Loss
 from pipeline.logs.remote import RemotePath, to_location
 from pipeline.logs.schema import definition_text, parse_msg
@@ -195,7 +195,11 @@ class _Collected:
         self.last = time
 
     def take(self) -> dict[int, Payloads]:
-        taken = {number: join_payloads(*lists) for number, lists in self.messages.items()}
+        taken = {
+            number: join_payloads(time, time, payloads)
+            for number, (times, payloads) in self.messages.items()
+            for time in [np.array(times, dtype=np.int64)]
+        }
         self.messages, self.size = {}, 0
         return taken
 
@@ -430,11 +434,13 @@ def _read_table(source: ByteSource, table: TextTable) -> Payloads | None:
         seconds, nanoseconds = np.divmod(rows.times, 1_000_000_000)
         given |= {"header.stamp.sec": seconds, "header.stamp.nanosec": nanoseconds}
     given |= table.texts
-    groups = [
-        Group(block.shape[0], block.shape[1], block.reshape(-1), chosen)
-        for chosen, block in encode_rows(structure, rows.times.size, given, where=table.topic)
-    ]
-    return Payloads(rows.times, rows.times, groups)
+    written, blocks = [], []
+    for chosen, encoded in encode_rows(structure, rows.times.size, given, where=table.topic):
+        size = np.full(chosen.size, encoded.shape[1])
+        written.append(chosen)
+        blocks.append(Block(encoded.reshape(-1), np.cumsum(size) - size, size))
+    whole, order = join_blocks(blocks), np.argsort(np.concatenate(written))
+    return Payloads(rows.times, rows.times, Block(whole.data, whole.start[order], whole.size[order]))
 
 
 @dataclass(slots=True)
