@@ -176,7 +176,7 @@ def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags
         findings.append(Finding("quaternion_not_unit", "warning", text, where=topic, count=off))
     bad = int((~usable).sum())
     if bad:
-        text = f"{bad} poses of {topic} have no orientation (a zero quaternion or not a number): quarantined"
+        text = f"{bad} poses of {topic} have no orientation (a zero quaternion or not a number): left out"
         findings.append(Finding("bad_quaternion", "warning", text, where=topic, count=bad))
     return scaled, usable, findings
 
@@ -207,7 +207,7 @@ def cut_track(
     finite = np.isfinite(position).all(axis=1)
     lost = int((~finite & oriented).sum())
     if lost:
-        text = f"{lost} poses of {topic} are not numbers: quarantined"
+        text = f"{lost} poses of {topic} are not numbers: left out"
         findings.append(Finding("bad_pose", "warning", text, where=topic, count=lost))
     valid = oriented & finite
     segment = np.zeros(times.size, dtype=np.int64)
@@ -225,7 +225,7 @@ def cut_track(
         count = int(apart.sum())
         text = (
             f"{count} pose{'s' * (count > 1)} of {topic} lie{'s' * (count == 1)} far from those before and "
-            "after: quarantined"
+            "after: left out"
         )
         findings.append(Finding("poses_apart", "warning", text, where=topic, count=count))
         position, valid[good[apart]] = position.copy(), False

@@ -126,12 +126,13 @@ class _Part:
         decided = [verdict for verdict in verdicts if verdict != UNTESTED]
         if not decided:
             return "no pair can be tested"
+        is_one = len(verdicts) == 1
         if OF_TWO_RUNS in decided and DIFFERENT not in decided:
-            return (
-                f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs: "
-                "more runs are needed to compare the grounds"
-            )
-        return f"{decided.count(DIFFERENT) or 'none'} of {format_count(len(verdicts), 'pair')} significant"
+            which = "they" if is_one else f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs"
+            return f"{which} differ, but as two single runs: more runs are needed to compare the grounds"
+        if is_one:
+            return f"{'a' if DIFFERENT in decided else 'no'} significant difference"
+        return f"{decided.count(DIFFERENT) or 'none'} of {len(verdicts)} pairs significant"
 
 
 def orient_ratio(row: Mapping[str, object], over: str) -> Ratios | None:
@@ -279,7 +280,7 @@ def _describe_equal(part: _Part, labels: Mapping[str, str]) -> str:
     if quotient is None:
         return f"{labels[hardest]} and {labels[easiest]} have no driving in common; {part.count()}"
     ratio, row = quotient
-    sure = ", not significant" if judge_pair(row) == ALIKE else ""
+    sure = ", not significant" if judge_pair(row) == ALIKE and len(part.pairs) > 1 else ""
     return f"{labels[hardest]} {format_ratio(ratio)} times {labels[easiest]}{sure}; {part.count()}"
 
 
@@ -310,9 +311,16 @@ def _split_difference(
     )
 
 
+_REPEATED = frozenset({"dataset", "vehicle", "terrain"})
+"""Columns of which a new run may have the same value."""
+
+
 def _advise_runs(equal: _Part, undriven: Sequence[str]) -> str:
     """Runs that would make differences at equal driving significant, and how to drive them; or nothing."""
     rows = equal.pairs.values()
+    # A run, or a month, cannot be driven again.
+    if not all(_REPEATED.issuperset(str(row["by"]).split(",")) for row in rows):
+        return ""
     if any(row["note"] == NO_SPREAD for row in rows):
         return "two more runs on any of these grounds would show how much runs of one ground differ"
     foreseen = foresee_pairs(rows)

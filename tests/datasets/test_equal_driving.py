@@ -275,6 +275,9 @@ def test_the_effect_that_carries_a_difference_is_named_with_and_without_estimate
     # sqrt(2.5) - sqrt(0.5) = 0.87 m/s, and skid is all of it.
     assert pair.carrier == "lateral skid +0.87 m/s"
     assert list_pairs(compare_results(store, Question()), "command")[0].carrier == ""
+    runs = list_lines(compare_results(store, Question(by=("run",))))
+    assert "at equal driving" in {line.driving for line in runs}
+    assert "to know more" not in {line.driving for line in runs}, "no run can be driven again"
 
 
 def test_the_levels_stand_in_the_table_of_datasets(answer: Answer) -> None:
