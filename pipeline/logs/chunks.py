@@ -1,7 +1,6 @@
 """Chunks of an MCAP file or a bag: inflating them within size limits, and locating the messages in them."""
 
 import bz2
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -30,8 +29,6 @@ _MAX_RATIO: Final = {"": 1, "zstd": 40_000, "lz4": 260}
 _LZ4_FLAGS: Final = 4
 _LZ4_HAS_CHECKSUM: Final = 0x04
 """Bit in the flags after the magic number of an LZ4 frame."""
-
-_per_thread = threading.local()
 
 
 class InflateError(ValueError):
@@ -127,20 +124,12 @@ def holds_own_checksum(stored: Buffer, compression: str) -> bool:
     return False
 
 
-def _zstd() -> zstandard.ZstdDecompressor:
-    """Decompressor of the current thread."""
-    decompressor: zstandard.ZstdDecompressor | None = getattr(_per_thread, "zstd", None)
-    if decompressor is None:
-        decompressor = _per_thread.zstd = zstandard.ZstdDecompressor()
-    return decompressor
-
-
 def _inflate_zstd(stored: Buffer, size: int) -> bytes:
     with _naming_damage():
         said = zstandard.frame_content_size(stored)
         if said not in (-1, size):
             raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
-        return _zstd().decompress(stored, max_output_size=size)
+        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
 
 
 def _inflate_lz4(stored: Buffer, size: int) -> Buffer:

@@ -390,9 +390,7 @@ class ColumnParts:
         if not self._leaf.ragged:
             values = _take(values, order)
             return Strings(values.astype(np.int32, copy=False), texts) if self._leaf.text else values
-        if not _is_plain(order, count.size):
-            values = take_ragged(values, count, order)
-        offsets = np.append(0, np.cumsum(count[order]))
+        values, offsets = take_rows(values, count, order)
         if self._leaf.text:
             return RaggedStrings(values.astype(np.int32, copy=False), texts, offsets)
         return Ragged(values, offsets)
@@ -427,6 +425,13 @@ class _Growing(Generic[Scalar]):
 
 def _take(values: NDArray[np.generic], order: Ints) -> NDArray[np.generic]:
     return values if _is_plain(order, values.shape[0]) else values[order]
+
+
+def take_rows(values: NDArray[np.generic], counts: Ints, order: Ints) -> tuple[NDArray[np.generic], Ints]:
+    """Values of ragged rows, reordered by row, and their offsets."""
+    if not _is_plain(order, counts.size):
+        values = take_ragged(values, counts, order)
+    return values, np.append(0, np.cumsum(counts[order]))
 
 
 def _is_plain(order: Ints, size: int) -> bool:

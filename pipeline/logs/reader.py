@@ -30,6 +30,7 @@ from pipeline.logs.columns import (
     join_times,
     share_times,
 )
+from pipeline.logs.decode import take_rows
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
 from pipeline.logs.other_formats import BagMessages, read_other
 from pipeline.logs.part import count_fetched, hash_sources, open_source
@@ -501,29 +502,18 @@ def join_channels(channels: Sequence[TopicColumns]) -> TopicColumns | None:
 
 
 def _join(columns: Sequence[Column], order: Ints) -> Column:
-    ragged = [column for column in columns if isinstance(column, Ragged)]
-    if ragged:
-        rows, offsets = _reorder_rows([column.offsets for column in ragged], order)
-        return Ragged(np.concatenate([column.values for column in ragged])[rows], offsets)
-    lists = [column for column in columns if isinstance(column, RaggedStrings)]
-    if lists:
-        codes, values = _merge_codes([(column.codes, column.values) for column in lists])
-        rows, offsets = _reorder_rows([column.offsets for column in lists], order)
-        return RaggedStrings(codes[rows], values, offsets)
-    texts = [column for column in columns if isinstance(column, Strings)]
-    if texts:
-        codes, values = _merge_codes([(column.codes, column.values) for column in texts])
-        return Strings(codes[order], values)
-    return np.concatenate([column for column in columns if isinstance(column, np.ndarray)])[order]
-
-
-def _reorder_rows(parts: Sequence[Ints], order: Ints) -> tuple[Ints, Ints]:
-    """Source index of each value of reordered rows, and the new offsets."""
-    counts = np.concatenate([np.diff(offsets) for offsets in parts])
-    starts = np.cumsum(counts) - counts
-    offsets = np.concatenate(([0], np.cumsum(counts[order])))
-    inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts[order])
-    return np.repeat(starts[order], counts[order]) + inside, offsets
+    plain = [column for column in columns if isinstance(column, np.ndarray)]
+    if plain:
+        return np.concatenate(plain)[order]
+    texts = [column for column in columns if isinstance(column, Strings | RaggedStrings)]
+    codes, names = _merge_codes([(column.codes, column.values) for column in texts])
+    lists = [column for column in columns if isinstance(column, Ragged | RaggedStrings)]
+    if not lists:
+        return Strings(codes[order], names)
+    values = codes if texts else np.concatenate([one.values for one in lists if isinstance(one, Ragged)])
+    counts = np.concatenate([np.diff(column.offsets) for column in lists])
+    values, offsets = take_rows(values, counts, order)
+    return RaggedStrings(values.astype(np.int32), names, offsets) if texts else Ragged(values, offsets)
 
 
 def _merge_codes(
@@ -535,4 +525,4 @@ def _merge_codes(
     for own, values in parts:
         table = np.array([common.setdefault(text, len(common)) for text in values] + [-1], dtype=np.int32)
         codes.append(table[own])
-    return np.concatenate(codes), tuple(common)
+    return np.concatenate([np.empty(0, dtype=np.int32), *codes]), tuple(common)
