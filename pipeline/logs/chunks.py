@@ -192,8 +192,7 @@ class Messages:
         sequence: sequence number assigned by the writer, uint32.
         log_time: [ns], int64.
         publish_time: [ns], int64.
-        schemas: schema records of the chunk.
-        channels: channel records of the chunk.
+        descriptions: schema and channel records of the chunk.
         damage: ranges (start, end) of the chunk without a readable record.
         walked: whether the chunk was scanned because no message index agrees with its records.
     """
@@ -204,15 +203,9 @@ class Messages:
     sequence: NDArray[np.uint32]
     log_time: Ints
     publish_time: Ints
-    schemas: list[Schema] = field(default_factory=list)
-    channels: list[Channel] = field(default_factory=list)
+    descriptions: list[Schema | Channel] = field(default_factory=list)
     damage: list[tuple[int, int]] = field(default_factory=list)
     walked: bool = False
-
-    @property
-    def descriptions(self) -> list[Schema | Channel]:
-        """Schema and channel records of the chunk."""
-        return [*self.schemas, *self.channels]
 
 
 @dataclass(slots=True)
@@ -220,8 +213,7 @@ class _WalkedChunk:
     effort: Effort
     known: set[tuple[int, bytes]] = field(default_factory=set)
     offsets: list[int] = field(default_factory=list)
-    schemas: list[Schema] = field(default_factory=list)
-    channels: list[Channel] = field(default_factory=list)
+    descriptions: list[Schema | Channel] = field(default_factory=list)
     damage: list[tuple[int, int]] = field(default_factory=list)
 
 
@@ -263,8 +255,7 @@ def locate_messages(
         sequence=heads["sequence"].copy(),
         log_time=heads["log_time"].astype(np.int64),
         publish_time=np.minimum(heads["publish_time"], _LAST_TIME).astype(np.int64),
-        schemas=located.schemas,
-        channels=located.channels,
+        descriptions=located.descriptions,
         damage=located.damage,
         walked=agreed is None,
     )
@@ -334,12 +325,9 @@ def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
         record = rec.parse_record(opcode, body)
     except rec.RecordError:
         return False
-    if isinstance(record, Schema):
-        located.schemas.append(record)
-    elif isinstance(record, Channel):
-        located.channels.append(record)
-    else:
+    if not isinstance(record, Schema | Channel):
         return False
+    located.descriptions.append(record)
     located.known.add(content)
     return True
 
