@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import guess_names
+from pipeline.core import guess_names, name_first
 from pipeline.datasets.pooling import (
     ComparisonError,
     add_measures,
@@ -194,7 +194,11 @@ def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedR
 
 def _note_left_out(reason: str, runs: Sequence[str]) -> str:
     count = f" ({len(runs)} runs)" if len(runs) > 1 else ""
-    return f"left out, {reason}{count}: {', '.join(runs)}"
+    return f"left out, {reason}{count}: {', '.join(name_first(runs, _MOST_NAMED))}"
+
+
+_MOST_NAMED = 12
+"""Most runs that a note names: a few lines of a screen."""
 
 
 def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
