@@ -280,8 +280,11 @@ def _describe_equal(part: _Part, labels: Mapping[str, str]) -> str:
     if quotient is None:
         return f"{labels[hardest]} and {labels[easiest]} have no driving in common; {part.count()}"
     ratio, row = quotient
-    sure = ", not significant" if judge_pair(row) == ALIKE and len(part.pairs) > 1 else ""
-    return f"{labels[hardest]} {format_ratio(ratio)} times {labels[easiest]}{sure}; {part.count()}"
+    said = f"{labels[hardest]} {format_ratio(ratio)} times {labels[easiest]}"
+    if not part.has_difference:
+        return f"{said}; {part.count()}: these runs do not tell them apart"
+    sure = ", not significant" if judge_pair(row) == ALIKE else ""
+    return f"{said}{sure}; {part.count()}"
 
 
 def _split_difference(

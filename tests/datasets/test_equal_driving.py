@@ -206,7 +206,7 @@ def test_the_runs_that_would_tell_are_foreseen() -> None:
     counts = []
     for count in (size - 1, size):
         limit = []
-        for _ in range(200):
+        for _ in range(100):
             groups = [rng.normal(mean, 0.2, count) for mean in (0.0, 0.6, 0.6)]
             limit += [
                 one.p_adjusted <= 0.05 for one in compare_means(groups, [(0, 1), (0, 2)], tests=9).differences
