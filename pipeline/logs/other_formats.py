@@ -107,17 +107,13 @@ def _note_connection(connection: Connection, catalog: Catalog) -> None:
     catalog.counts[number] = connection.msgcount
 
 
-@dataclass(slots=True)
-class BagMessages:
-    """Some messages of a bag, or those of a text table: payloads by channel number, and the losses so far."""
-
-    payloads: dict[int, Payloads] = field(default_factory=dict)
-    losses: list[Loss] = field(default_factory=list)
+Held = tuple[dict[int, Payloads], list[Loss]]
+"""Some messages of a bag, or those of a text table: payloads by channel number, and the losses so far."""
 
 
 def read_other(
     source: ByteSource, path: Path, container: str, numbers: AbstractSet[int], most: int
-) -> Iterator[BagMessages]:
+) -> Iterator[Held]:
     """Read the messages of some channels of a bag or a text table in the order of their times.
 
     Args:
@@ -135,10 +131,10 @@ def read_other(
         return _read_bag(path, container, numbers, most)
     rows = _read_table(source, described[1])
     held = {} if rows is None else dict.fromkeys(numbers, rows)
-    return iter([BagMessages(held)] if numbers else [])
+    return iter([(held, [])] if numbers else [])
 
 
-def _read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -> Iterator[BagMessages]:
+def _read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -> Iterator[Held]:
     """Read the messages of a bag, a few megabytes at a time."""
     allowance = Allowance(most, most)
     collected = _Collected(allowance)
@@ -150,7 +146,7 @@ def _read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) 
             for connection, time, data in reader.messages(wanted):
                 collected.add(connection.id, time, data)
                 if collected.size > _TOGETHER:
-                    yield BagMessages(collected.take())
+                    yield collected.take(), []
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 - exceptions caused by damage have no common type
@@ -161,7 +157,7 @@ def _read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) 
     if collected.odd:
         text = f"{collected.odd} messages of the {container} have no time or no content that can be read"
         collected.losses.append(Loss("damaged_record", text))
-    yield BagMessages(collected.take(), collected.losses)
+    yield collected.take(), collected.losses
 
 
 @dataclass(slots=True)

@@ -32,7 +32,7 @@ from pipeline.logs.columns import (
 )
 from pipeline.logs.decode import take_rows
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
-from pipeline.logs.other_formats import BagMessages, read_other
+from pipeline.logs.other_formats import read_other
 from pipeline.logs.part import count_fetched, hash_sources, open_source
 from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
@@ -367,7 +367,8 @@ def _read_part(
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
-        return (_gather_bag(part, held) for held in read_other(source, part.path, container, own, most))
+        held = read_other(source, part.path, container, own, most)
+        return (_gather_bag(part, payloads, losses) for payloads, losses in held)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
@@ -382,11 +383,11 @@ def _read_part(
     return load_spans(source, spans, gather, threads=threads, file_holds=section.holds)
 
 
-def _gather_bag(part: Part, messages: BagMessages) -> _Gathered:
-    merged = {part.numbers[number]: each for number, each in messages.payloads.items()}
+def _gather_bag(part: Part, payloads: Mapping[int, Payloads], losses: list[Loss]) -> _Gathered:
+    merged = {part.numbers[number]: each for number, each in payloads.items()}
     # Bags store no checksums of their messages.
     stretch = int(bool(merged))
-    return _Gathered(merged, messages.losses, stretch, stretch, index_damaged=False)
+    return _Gathered(merged, losses, stretch, stretch, index_damaged=False)
 
 
 def _spans_with(part: Part, own: set[int]) -> list[Span]:
