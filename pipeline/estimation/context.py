@@ -77,7 +77,8 @@ class Context:
         sampling = self.sampling_s if encoders else 0.0
         exceeded = self.problem.exceeded
         slope = max(comparison.context.slope_rad for comparison in self.problem.comparisons)
-        return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope)
+        course = any(run.is_on_course for run in self.runs)
+        return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope, course)
 
     @property
     def sampling_s(self) -> float:

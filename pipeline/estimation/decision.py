@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from pipeline.core import NORMAL_95, Budget, format_share
-from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
+from pipeline.estimation.candidates import PRICE, Candidate, Screen, list_starts
 from pipeline.estimation.fit import PartFit, approach, fit_part
 from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.noise import huber_cost
@@ -304,16 +304,19 @@ class Search:
         Args:
             base: the model.
             screen: what they promise.
-            singles: most that are by one effect.
+            singles: most that are by one effect and better than none.
             pairs: most that are by two.
             wanted: expected gain, less price, that they must exceed.
             reached: cost of the model that they would replace.
         """
-        extensions: list[Extension] = [one for one in screen.list_singles() if one.net > wanted][:singles]
-        extensions += [one for one in screen.list_pairs() if one.net > wanted][:pairs]
-        # Some steps show which may come near the best.
-        rough = [approach(base, one.add_to(base.state)) for one in extensions]
-        judged, before = dict[tuple[str, ...], Judged](), find_cost(base)
+        judged, before, rough = dict[tuple[str, ...], Judged](), find_cost(base), list[PartFit]()
+        for extensions, places in ((screen.list_singles(), singles), (screen.list_pairs(), pairs)):
+            # Some steps show which may come near the best, and which keep nothing of what they promise.
+            for extension in extensions:
+                if not places or not extension.net > wanted:
+                    break
+                rough.append(approach(base, extension.add_to(base.state)))
+                places -= find_cost(rough[-1]) < before  # noqa: PLW2901
         for start in sorted(rough, key=find_cost):
             if find_cost(start) > reached + _NEAR * max(before - reached, 0.0):
                 break
@@ -418,7 +421,7 @@ class Search:
             screen = self.screen(without, names)
             own = without.score - current.score
             wanted = 0.3 * own - PRICE * len(names)
-            self._rivals[key] = self._judge_extensions(without, screen, 2, 1, wanted, find_cost(current))
+            self._rivals[key] = self._judge_extensions(without, screen, 4, 1, wanted, find_cost(current))
         return self._rivals[key]
 
     def replaces(self, current: PartFit, other: Judged, margin: float = 0.0) -> bool:
@@ -442,10 +445,10 @@ class Search:
         effect = candidate()
         cases = [name for name in current.ids if name in (*effect.contains, *effect.companions)]
         cases = [name for name in cases if name not in self.given]
-        if not effect.contains or not effect.starts or candidate.id in current.ids:
+        if not effect.contains or not (cases or effect.starts) or candidate.id in current.ids:
             return None
         base, largest = self._drop(current, cases), self.conditions.largest
-        starts = [base.state.add(candidate(**values)) for values in effect.list_starts(largest)]
+        starts = [base.state.add(candidate(**values)) for values in list_starts(candidate, largest)]
         # Some steps show whether it may come near what its special cases explain.
         rough = [approach(base, state) for state in starts]
         own, explained = find_cost(current), find_cost(base) - find_cost(current)

@@ -170,6 +170,7 @@ class Conditions:
         exceeded: half-second means that measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`,
             `turn`, `wheel`.
         slope_rad: half of the range of pitch over nine tenths of the time; zero where it was not recorded.
+        course: whether the heading of a run is its course over ground, which no position can precede.
     """
 
     largest: Largest
@@ -178,6 +179,7 @@ class Conditions:
     least_delay_s: float = 0.0
     exceeded: Mapping[str, float] = field(default_factory=dict)
     slope_rad: float = 0.0
+    course: bool = False
 
     def attain(self, limit: float, of: Relative) -> bool:
         """Whether commands exceeded a limit, and measured wheels, if any, reached it."""

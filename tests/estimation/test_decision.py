@@ -128,6 +128,22 @@ def test_of_two_effects_that_do_the_same_both_are_reported() -> None:
         assert value.low < expected < value.high
 
 
+def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
+    """Beside a lag, slower braking promises little: it is looked for in its place."""
+    times = np.arange(0.0, 90.0, 0.05)
+    speed = np.where(times % 15.0 > 9.0, 0.4 + 0.1 * (times // 15.0), 0.0)
+    played = Commands(times, speed, np.zeros(times.size))
+    run = drive({"brake_lag": {"tau_drive": 0.3, "tau_brake": 1.5}}, duration_s=90.0, played=played)
+    context = prepare([run], HUSKY, Input.COMMAND)
+    lags = [one for one in context.list_candidates(Input.COMMAND) if one.id in {"drive_lag", "brake_lag"}]
+    made = Search(context.problem.parts[-1], tuple(lags), context.conditions)
+    one_lag = made.fit(context.problem.start_state().add(find_effect("drive_lag")(tau=0.9)))
+    whole = made._try_whole(one_lag, next(one for one in lags if one.id == "brake_lag"))
+    assert whole is not None
+    assert whole.ids == ("brake_lag",)
+    assert estimate_part(whole).find("brake_lag.tau_brake").value == pytest.approx(1.5, abs=0.1)
+
+
 def test_a_refusal_says_why() -> None:
     run = drive({"effective_track": 1.6})
     reasons = {

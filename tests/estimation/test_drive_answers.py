@@ -17,12 +17,14 @@ from pipeline.simulate import (
     VEHICLES,
     Disturbance,
     Ground,
+    PoseSensor,
     Program,
     Scenario,
     simulate_case,
     simulate_run,
     write_log,
 )
+from pipeline.simulate.scenario import Commands
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -146,3 +148,39 @@ def test_a_lag_behind_a_limit_is_no_torque_limit(tmp_path: Path) -> None:
     write_log(simulate_run(scenario), tmp_path / "run.mcap")
     told = _diagnose(tmp_path / "run.mcap")
     assert {effect.id for effect in told.effects} == {*hidden}
+
+
+def test_a_load_taken_on_halfway_is_a_change(tmp_path: Path) -> None:
+    """Seven percent less travel from a moment on, beyond any doubt, was too small for a name."""
+    scenario = Scenario(
+        vehicle=VEHICLES["husky"],
+        effects={"terrain_change": {"k_v": 0.93, "k_w": 0.93, "at_s": 80.0}},
+        duration_s=160.0,
+        seed=3,
+        disturbance=Disturbance(0.01, 0.01),
+    )
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    (named,) = _diagnose(tmp_path / "run.mcap").effects
+    assert named.id == "terrain_change"
+    assert named.parameters["k_v"].value == pytest.approx(0.93, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_circle_one_way_does_not_decide_what_turns_it(seed: int, tmp_path: Path) -> None:
+    """Sideways effects of a millimetre, which kept nothing of their promise, took the places of rivals."""
+    time = np.arange(0.0, 90.0, 0.05)
+    speed = np.where(time < 2.0, 0.0, 0.4)
+    scenario = Scenario(
+        vehicle=VEHICLES["jackal"],
+        effects={"yaw_drift": {"c": 0.03}},
+        duration_s=90.0,
+        seed=seed,
+        disturbance=Disturbance(0.01, 0.01),
+        pose=PoseSensor(rate_hz=10.0, noise_m=0.004, noise_rad=0.002, drift_m=0.0, drift_rad=0.0),
+        played=Commands(time, speed, speed),
+    )
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    told = _diagnose(tmp_path / "run.mcap")
+    assert not told.effects
+    (group,) = told.undecided
+    assert {"wheel_asymmetry", "effective_track"} <= set(group.candidates)

@@ -71,5 +71,5 @@ class HeadingSkew(ReportEffect):
         return velocity
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Only with the reported heading, not with that of a gyro."""
-        return not conditions.gyro
+        """Only with the reported heading, not with that of a gyro or with one made of positions."""
+        return not conditions.gyro and not conditions.course

@@ -25,7 +25,7 @@ from pipeline.models.effect import (
 from pipeline.models.parameter import Conditions
 from pipeline.run import Rolling, RunContext
 
-_LEAST = Least(0.08, Least.GROUND)
+_LEAST = Least(0.03, Least.GROUND)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
 
 
