@@ -26,6 +26,7 @@ from pipeline.words.errors import format_excess, format_step
 
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
+_NOTHING_EVIDENT = "No effect is evident"
 NO_GROUND = "the log holds no pose: slip is that of the wheels against their commands, not that of the ground"
 _UNKNOWN = "no known effect explains the rest"
 _MOST_CLAUSES = 3
@@ -110,7 +111,8 @@ def _format_nothing(run: RunDiagnosis) -> list[str]:
     if not list_excess(run):
         return [*sentences, "The noise floor of this run is not known"]
     if measure_excess(run) < ABOVE_FLOOR and run.unexplained is None:
-        return sentences or [NOTHING_MISSING]
+        is_at_floor = format_excess(measure_excess(run)) == format_excess(1.0)
+        return sentences or [NOTHING_MISSING if is_at_floor else _NOTHING_EVIDENT]
     if run.undecided:
         return [
             *sentences,

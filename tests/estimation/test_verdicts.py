@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+from drawn_diagnoses import FLOOR, draw_diagnosis
 from test_diagnosis import _SCENE, _diagnose
 
 from pipeline.simulate import VEHICLES
 from pipeline.words.diagnosis import describe
 from pipeline.words.errors import describe_rest, describe_structure
 from pipeline.words.objects import diagnosis_as_json
-from pipeline.words.verdict import NOTHING_MISSING
+from pipeline.words.verdict import NOTHING_MISSING, format_verdict
 
 _HUSKY = replace(_SCENE, vehicle=VEHICLES["husky"])
 _CLAIMS = (
@@ -34,6 +36,12 @@ def test_a_run_that_is_long_enough_may_miss_nothing(tmp_path: Path) -> None:
     assert NOTHING_MISSING in describe(diagnosis.runs)
     assert diagnosis.runs[0].concentrated is None
     assert "not depend on any recorded signal" in describe_rest(diagnosis.runs[0])
+
+
+@pytest.mark.parametrize(("excess", "said"), [(1.1, NOTHING_MISSING), (1.4, "No effect is evident")])
+def test_above_the_floor_nobody_knows_that_nothing_is_missing(excess: float, said: str) -> None:
+    diagnosis = draw_diagnosis({}, [(FLOOR["t_mrmse_m"], excess * FLOOR["r_mrmse_rad"])])
+    assert format_verdict(diagnosis).endswith(f"{said}.")
 
 
 def test_an_error_that_a_wet_patch_makes_is_told_by_where_it_is(tmp_path: Path) -> None:
