@@ -29,15 +29,18 @@ _FORMATS: Mapping[str, Callable[[float], str]] = {
     "percent": lambda value: format_share(value, 3),
     "less": lambda value: f"{format_share(abs(1.0 - value), 0)} {'less' if value <= 1.0 else 'more'}",
 }
+_BRISK_MPS = 3.0
+"""Speed at which an effect that grows with it is told [m/s]; of a slower vehicle, its largest."""
 
 
 class Words(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Templates of one effect.
 
     A template holds fields ``{formula:format}`` over the parameters, ``radius``, ``track`` and ``wheelbase``
-    of the vehicle, and ``others``. A format is one of Python's, one of `_FORMATS`, or two words for a
-    positive and a negative number, ``left|right``. Of several templates the first applies whose numbers are
-    all known; of the last one, parts after a comma or in brackets with an unknown number are left out.
+    of the vehicle, ``brisk``, a speed that it reaches, and ``others``. A format is one of Python's, one of
+    `_FORMATS`, or two words for a positive and a negative number, ``left|right``. Of several templates the
+    first applies whose numbers are all known; of the last one, parts after a comma or in brackets with an
+    unknown number are left out.
 
     Attributes:
         motion: name, colon, and what the vehicle does.
@@ -108,6 +111,7 @@ class Sentences:
             "radius": vehicle.wheel_radius_m,
             "track": math.nan if "track_width_m" in vehicle.stand_ins else vehicle.track_width_m or 1.0,
             "wheelbase": vehicle.wheelbase_m or 1.0,
+            "brisk": min(_BRISK_MPS, vehicle.max_speed_mps or math.inf),
         }
         values = {**self.values, **geometry, "others": math.prod(acting.values())}
         unknown = {*self.unknown, *(name for name, value in values.items() if not math.isfinite(value))}
