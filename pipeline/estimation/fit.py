@@ -31,6 +31,11 @@ _SETTLED = 1e-8
 """The same for a model that is written: it ends at the same values from every start."""
 _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
+_CONVERGING = 0.3
+"""Ratio of what two steps with the same derivatives promise, above which these are computed anew."""
+_NO_INFLUENCE = 1e-6
+"""Change of the innovations, in standard deviations over the whole run, by a parameter's step: a number with
+less, such as that of a limit that is never reached, stays where it is."""
 _MOST_STEPS, _FEW_STEPS = 30, 3
 """Steps of a fit, and of one that shows whether a model may come near the best one."""
 _SHARES = (1.0, 0.5, 0.25, 0.1)
@@ -277,47 +282,44 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
 def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False) -> PartFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
-    Its derivatives are those of where it ends, or of where all further steps together were no news. A rough
-    one takes few steps and leaves them as they were before the last one. Where no step lowers the cost as
-    promised, central differences are tried once.
+    Derivatives are computed anew after a step that was news, and where steps without become hardly smaller:
+    at the end they are those of the last place but for steps that were none. A rough one takes few steps and
+    leaves them as they were before the last one.
     """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
-    damping, gained, fallen, is_stale = _LOOSEST, 0.0, 0.0, False
-    near = 0.0 if exact else _NEWS
-    is_failing, is_central = False, exact or rough
+    near, most = 0.0 if exact else _NEWS, _FEW_STEPS if rough else _MOST_STEPS
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
+    damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-    for _ in range((_FEW_STEPS if rough else _MOST_STEPS) if fit.smooth else 0):
-        if is_stale:
-            columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact or is_failing)
-            fit, gained, is_stale = replace(fit, columns=columns), 0.0, False
+    for count in range(1, most + 1 if fit.smooth else 1):
         moving, step, promised = _solve(fit, damping)
         fall = 0.0
-        if promised >= enough:
+        if promised >= enough and (is_fresh or promised < _CONVERGING * before):
             state = fit.state.move(moving, step)
             residual = part.find_residuals(state)
             fall = cost - measure_cost(part, fit.noise, state, free, residual)
         if fall > 0.0:
-            fit, cost, damping = replace(fit, state=state, residual=residual), cost - fall, damping / 30.0
-            damping, gained, fallen = max(damping, 1e-9), gained + fall, fallen + fall
-            if 0.0 < fall <= near:
+            fit, cost, fallen = replace(fit, state=state, residual=residual), cost - fall, fallen + fall
+            damping = max(damping / 30.0, 1e-9)
+            if fall <= near:
+                is_fresh, before = False, promised
                 continue
-        elif gained <= near and promised >= enough and damping <= _STIFFEST:
+        elif is_fresh and promised >= enough and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
+            # Where limits are met, the cost is rough: there, no place is better to the last digit.
+            enough = _ENOUGH if promised < _NEWS else enough
             continue
-        # No step falls as promised: one-sided derivatives may be wrong where a limit is met.
-        is_failing = gained <= near and promised >= enough and not is_central
-        is_stale, is_central = gained > near or is_failing, is_central or is_failing
-        damping = _LOOSEST if is_failing else damping
-        if fallen > most_fallen and not (is_failing or 0.0 < fall <= _NEWS):
-            fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
-            cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-            damping, fallen = _LOOSEST, 0.0
-        elif not is_stale:
+        elif (is_fresh or promised < enough) and fallen <= most_fallen:
             break
-    if gained > near and not rough:
-        fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
+        if fallen > most_fallen:
+            fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
+            cost, fallen = measure_cost(part, fit.noise, fit.state, free, fit.residual), 0.0
+        if rough and count == most:
+            break
+        if fall > 0.0 or not is_fresh:
+            fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
+        is_fresh, before = True, math.inf
     return fit
 
 
@@ -326,7 +328,10 @@ def _solve(fit: PartFit, damping: float) -> tuple[list[Free], list[float], float
     part, free, white = fit.part, fit.free, fit.white
     pulls = white.columns.T @ white.residual + part.prior.pull(fit.state, free)
     moving = [
-        index for index in fit.smooth if not _is_pushed_out(fit.state, free[index], float(pulls[index]))
+        index
+        for index in fit.smooth
+        if math.sqrt(fit.normal[index, index]) * free[index].step > _NO_INFLUENCE
+        and not _is_pushed_out(fit.state, free[index], float(pulls[index]))
     ]
     if not moving:
         return [], [], 0.0
