@@ -58,8 +58,8 @@ _LARGEST_DELAY = 0.6
 
 
 _NARROW = 0.01
-"""Share of a parameter's step for a derivative away from the bounds: with whole steps, half of the fits to ice
-end 8 above the least cost, with a tenth .5, with a hundredth or a thousandth .3."""
+"""Share of a parameter's step for a derivative away from the bounds: with whole steps, half of the fits to
+ice end 8 above the least cost, with a tenth .5, with a hundredth or a thousandth .3."""
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,17 @@ def test_one_step_of_the_wheels_is_answered_as_the_equations_say() -> None:
     assert got[:, -1] == pytest.approx(means[:, -1], abs=2e-3)
 
 
+@pytest.mark.parametrize("friction", [0.1, 0.3, 0.9])
+def test_a_drive_moves_as_with_far_shorter_steps(friction: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps with the friction of their start made fits of a true friction of 0.3 end near 0.315."""
+    values = {"friction": friction, "creep": 0.3, "k": 1.8, "gyration": 1.1}
+    usual = _move(values, _compare())
+    monkeypatch.setattr("pipeline.models.effects.contact_friction._STEP_S", 1e-3)
+    short = _move(values, _compare())
+    assert not np.array_equal(usual, short)
+    assert np.sqrt(np.mean((usual - short) ** 2, axis=1)).max() < 4e-3
+
+
 @pytest.mark.parametrize("speed", [0.5, 2.0])
 def test_while_wheels_hardly_slide_the_lag_grows_with_speed_and_the_track_is_wider(speed: float) -> None:
     values = {"friction": math.inf, "creep": 3.0, "k": 1.8, "gyration": math.sqrt(1.8)}
