@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
@@ -62,6 +62,11 @@ class Input(enum.Enum):
 
     COMMAND = "command"
     MEASURED = "measured"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Never:
+        what = f"{value!r} is neither command nor measured"
+        raise MotionError("bad_value", what, where="input", hint="Models start at one of the two.")
 
 
 @dataclass(frozen=True)
