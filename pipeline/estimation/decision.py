@@ -236,8 +236,11 @@ class Search:
 
     def _exchange(self, current: PartFit) -> PartFit | None:
         """A better model with others in the place of one effect, or with an effect for its special cases."""
+        companions = {name for effect in current.state.effects for name in effect.companions}
         for candidate in self.candidates:
             whole = self._try_whole(current, candidate)
+            if whole is None and candidate.id in companions:
+                whole = self._try_beside(current, candidate)
             if whole is not None:
                 return whole
         for name in current.ids:
@@ -458,6 +461,22 @@ class Search:
             return None
         judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self.prune(fit)
+
+
+    def _try_beside(self, current: PartFit, candidate: Candidate) -> PartFit | None:
+        """The model with a companion of its effects, where it is better.
+
+        What a limit of the command promises to first order says nothing beside a servo, all of whose numbers
+        change with it.
+        """
+        if candidate.id in current.ids or not candidate().acts_in(current.ids):
+            return None
+        starts = list_starts(candidate, self.conditions.largest)
+        fits = (self.fit(current.state.add(candidate(**values))) for values in starts)
+        fit = self._reduce(min(fits, key=find_cost), current)
+        judged = self._judge(current, fit, is_final=False)
+        is_better = judged.added and not judged.refusal and judged.cost < find_cost(current) - EQUAL
+        return self.prune(fit) if is_better else None
 
 
 def _make_key(state: State) -> tuple[object, ...]:
