@@ -65,6 +65,8 @@ _NEAR = 0.2
 """Share of what the best one explains that it may lack after them to be fitted to the end."""
 _SURE = 0.95
 """Share of resampled recordings in which an effect must be better than a special case of it."""
+_TRIED = 2
+"""Extensions that are begun for each place."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.95 has a standard error of 0.01."""
 
@@ -315,7 +317,7 @@ class Search:
         judged, before, rough = dict[tuple[str, ...], Judged](), find_cost(base), list[PartFit]()
         for extensions, places in ((screen.list_singles(), singles), (screen.list_pairs(), pairs)):
             # Some steps show which may come near the best, and which keep nothing of what they promise.
-            for extension in extensions:
+            for extension in extensions[: _TRIED * places]:
                 if not places or not extension.net > wanted:
                     break
                 rough.append(approach(base, extension.add_to(base.state)))
@@ -462,7 +464,6 @@ class Search:
         judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self.prune(fit)
 
-
     def _try_beside(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with a companion of its effects, where it is better.
 
@@ -472,8 +473,9 @@ class Search:
         if candidate.id in current.ids or not candidate().acts_in(current.ids):
             return None
         starts = list_starts(candidate, self.conditions.largest)
-        fits = (self.fit(current.state.add(candidate(**values))) for values in starts)
-        fit = self._reduce(min(fits, key=find_cost), current)
+        rough = (approach(current, current.state.add(candidate(**values))) for values in starts)
+        best = min(rough, key=find_cost)
+        fit = self._reduce(self.fit(best.state, best.noise), current)
         judged = self._judge(current, fit, is_final=False)
         is_better = judged.added and not judged.refusal and judged.cost < find_cost(current) - EQUAL
         return self.prune(fit) if is_better else None
