@@ -400,7 +400,8 @@ class Search:
             for start in Screen(without, cases, self.conditions.largest).list_singles():
                 simpler = self.fit(start.add_to(without.state))
                 is_felt = _is_material(self.part, simpler.residual - fit.residual)
-                if not is_felt or self._judge(simpler, fit, is_final=True).frequency < _SURE:
+                judged = self._judge(simpler, fit, is_final=True)
+                if not is_felt or judged.refusal or judged.frequency < _SURE:
                     return simpler
         return None
 
@@ -474,7 +475,9 @@ class Search:
             return None
         starts = list_starts(candidate, self.conditions.largest)
         rough = (approach(current, current.state.add(candidate(**values))) for values in starts)
-        best = min(rough, key=find_cost)
+        best = min(rough, key=find_cost, default=None)
+        if best is None:
+            return None
         fit = self._reduce(self.fit(best.state, best.noise), current)
         judged = self._judge(current, fit, is_final=False)
         is_better = judged.added and not judged.refusal and judged.cost < find_cost(current) - EQUAL

@@ -144,6 +144,15 @@ def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
     assert estimate_part(whole).find("brake_lag.tau_brake").value == pytest.approx(1.5, abs=0.1)
 
 
+def test_a_companion_without_a_start_in_its_bounds_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measured wheels that exceed all starts of a limit leave it none."""
+    context = prepare([drive({}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    limit = find_effect("turn_acceleration_limit")
+    made = Search(context.problem.parts[-1], (limit,), context.conditions)
+    monkeypatch.setattr("pipeline.estimation.decision.list_starts", lambda *_: [])
+    assert made._try_beside(made.fit(context.problem.start_state()), limit) is None
+
+
 def test_a_refusal_says_why() -> None:
     run = drive({"effective_track": 1.6})
     reasons = {
