@@ -390,7 +390,7 @@ class Search:
                 refused = [one for names in others if (one := self._judge_last(fit, names)).refusal]
 
     def _simplify(self, fit: PartFit) -> PartFit | None:
-        """The model with a special case in the place of one that is nothing sure or felt beyond it."""
+        """The model with a special case in the place of what is not accepted, or not surely, beyond it."""
         for effect in fit.state.effects:
             taken = {effect.id, *self.given, *fit.ids}
             cases = [one for one in self.candidates if one.id in effect.contains and one.id not in taken]
@@ -399,9 +399,8 @@ class Search:
             without = self._drop(fit, [effect.id])
             for start in Screen(without, cases, self.conditions.largest).list_singles():
                 simpler = self.fit(start.add_to(without.state))
-                is_felt = _is_material(self.part, simpler.residual - fit.residual)
                 judged = self._judge(simpler, fit, is_final=True)
-                if not is_felt or judged.refusal or judged.frequency < _SURE:
+                if judged.refusal or judged.frequency < _SURE:
                     return simpler
         return None
 

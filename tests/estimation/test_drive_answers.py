@@ -58,6 +58,11 @@ def _diagnose(log: Path) -> RunDiagnosis:
     return told
 
 
+def _diagnose_drive(scenario: Scenario, folder: Path) -> RunDiagnosis:
+    write_log(simulate_run(scenario), folder / "run.mcap")
+    return _diagnose(folder / "run.mcap")
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.long) if name in _ALIKE else name for name in _DRIVES]
 )
@@ -71,8 +76,7 @@ def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path:
         seed=3,
         disturbance=Disturbance(0.02, 0.02),
     )
-    write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    told = _diagnose(tmp_path / "run.mcap")
+    told = _diagnose_drive(scenario, tmp_path)
     assert [effect.id for effect in told.effects] == [name]
     found = {key: number.value for key, number in told.effects[0].parameters.items()}
     assert found == pytest.approx(_DRIVES[name], rel=0.03)
@@ -125,8 +129,7 @@ def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(tmp_path: Path) -> 
         seed=15,
         disturbance=Disturbance(0.03, 0.05),
     )
-    write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    told = _diagnose(tmp_path / "run.mcap")
+    told = _diagnose_drive(scenario, tmp_path)
     named = {effect.id: effect.parameters for effect in told.effects}
     assert named.keys() == {"wheel_servo", "motor_imbalance"}
     for name in ("tau", "bound", "no_load", "scrub"):
@@ -145,8 +148,7 @@ def test_a_lag_behind_a_limit_is_no_torque_limit(tmp_path: Path) -> None:
         seed=2,
         disturbance=Disturbance(0.03, 0.05),
     )
-    write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    told = _diagnose(tmp_path / "run.mcap")
+    told = _diagnose_drive(scenario, tmp_path)
     assert {effect.id for effect in told.effects} == {*hidden}
 
 
@@ -159,8 +161,7 @@ def test_a_load_taken_on_halfway_is_a_change(tmp_path: Path) -> None:
         seed=3,
         disturbance=Disturbance(0.01, 0.01),
     )
-    write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    (named,) = _diagnose(tmp_path / "run.mcap").effects
+    (named,) = _diagnose_drive(scenario, tmp_path).effects
     assert named.id == "terrain_change"
     assert named.parameters["k_v"].value == pytest.approx(0.93, abs=0.01)
 
@@ -179,8 +180,7 @@ def test_a_circle_one_way_does_not_decide_what_turns_it(seed: int, tmp_path: Pat
         pose=PoseSensor(rate_hz=10.0, noise_m=0.004, noise_rad=0.002, drift_m=0.0, drift_rad=0.0),
         played=Commands(time, speed, speed),
     )
-    write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    told = _diagnose(tmp_path / "run.mcap")
+    told = _diagnose_drive(scenario, tmp_path)
     assert not told.effects
     (group,) = told.undecided
     assert {"wheel_asymmetry", "effective_track"} <= set(group.candidates)
