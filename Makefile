@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export LOG LOGS OUT VEHICLE ARGS NAME MINUTES
+export LOG LOGS OUT VEHICLE ARGS NAME
 
 # Exit code 3 means done, but a log had losses or was refused: that is on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses or logs that were refused (see above)" >&2 || exit $$code; }
@@ -20,8 +20,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-comp
 ONE_CORE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10
 
 .DEFAULT_GOAL := help
-.PHONY: analyze audit batch bench browser check clean compare docs docs-tables format fuzz help lock measure \
-	published samples serve test test-long wheel
+.PHONY: analyze batch bench browser check clean compare docs help hidden-effect samples serve test test-long
 
 help: ## print this list; `slip --help` lists what the program does
 	@awk -F ':.*## ' 'BEGIN { print "For users\n" } /^##@ / { print "\n" substr($$0, 5) "\n" } /^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' \
@@ -46,9 +45,6 @@ docs: $(VENV)/.ready-dev ## the handbook as pages that need no network, in build
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
-wheel: $(VENV)/.ready ## the program as one file to install, in dist
-	$(BIN)/python -m hatchling build --target wheel
-
 test: $(VENV)/.ready-dev ## the fast tests
 	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || \
 		echo "no Chromium here: tests that look at pages are left out (make browser)" >&2
@@ -72,45 +68,20 @@ test-long: $(VENV)/.ready-dev ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m long
 	$(BIN)/python -m pytest -n 2 -m "not long" --hypothesis-profile many tests/fuzz
 
-format: $(VENV)/.ready-dev ## format the code
-	$(BIN)/ruff format
-	$(BIN)/ruff check --fix
-
-audit: $(VENV)/.ready-dev ## licences and known advisories of the dependencies, and build/sbom.cdx.json
-	@$(BIN)/python benchmarks/audit.py $$ARGS
-
 bench: $(VENV)/.ready-dev ## the benchmarks; NAME=reader: one of them [ARGS="--help"]
 	@# Some systems have a NAME in the environment: only one that was given to make counts.
 	@$(ONE_CORE) $(BIN)/python benchmarks $(if $(findstring command,$(origin NAME)),"$$NAME") $$ARGS
 
-published: $(VENV)/.ready-dev ## published answers beside the program's, where the recordings are [ARGS=FOLDER]
-	@$(ONE_CORE) $(BIN)/python benchmarks published $$ARGS
-
-measure: $(VENV)/.ready-dev ## measure what the handbook says, go on where it was stopped [ARGS="paper accuracy"]
-	@$(ONE_CORE) $(BIN)/python benchmarks measure $$ARGS
-
-docs-tables: $(VENV)/.ready-dev ## write what was measured into the handbook [ARGS=--check]
-	@$(BIN)/python benchmarks measured_tables $$ARGS
+hidden-effect: $(VENV)/.ready-dev ## draw a log with a hidden effect, diagnose it, score it [ARGS="--category all --seeds 7"]
+	@$(ONE_CORE) $(BIN)/python benchmarks game/play $$ARGS
 
 samples: $(VENV)/.ready-dev ## make the simulated logs in data_samples again, and the truths of the mysteries
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --file data_samples/$$case.mcap || exit 1; done
 	$(BIN)/python benchmarks game/mystery write data_samples
 
-fuzz: $(VENV)/.ready-dev ## damaged files for every part, MINUTES=60 in all; finds go to fuzz_finds
-	@set -- tests/fuzz/fuzz_*.py; each=$$(awk "BEGIN { print $${MINUTES:-60} / $$# }"); failed=0; \
-	for script; do echo "$$script for $$each minutes"; $(BIN)/python "$$script" --minutes "$$each" || failed=1; done; \
-	exit $$failed
-
 browser: ## install Debian's Chromium, for the tests that look at pages
 	apt-get update && apt-get install --yes --no-install-recommends chromium
-
-lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
-	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra serve --output-file requirements.txt
-	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra all --extra build --extra dev --extra docs \
-		--constraint requirements.txt --output-file requirements-dev.txt
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

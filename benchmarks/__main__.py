@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 ENTRIES = frozenset({"run", "main"})
 """Functions that make a file a benchmark; one with `main` alone reads its own command line."""
 CHECKS = frozenset({"audit", "house"})
-"""Commands of `make audit` and `make check`, which measure nothing."""
+"""Commands of `make bench NAME=audit` and `make check`, which measure nothing."""
 
 
 def list_benchmarks() -> dict[str, str]:

@@ -86,7 +86,7 @@ def measure_accuracy(asked: Asked) -> dict[str, object]:
             f"accuracy: {late} logs took longer than {_PATIENCE_S} s; the same command plays them again"
         )
     return {
-        "command": "make measure ARGS=accuracy",
+        "command": "make bench NAME=measure ARGS=accuracy",
         "versions": {"diagnosis": list_versions()["diagnosis"]},
         "seeds": seeds,
         **summarize_records(records),
@@ -131,7 +131,7 @@ def measure_rivals(source: str) -> Callable[[Asked], dict[str, object]]:
             "rivals", "--results", str(asked.folder / "rivals"), "--input", source, "--rows", str(rows)
         )
         return {
-            "command": f"make measure ARGS=rivals_{source}",
+            "command": f"make bench NAME=measure ARGS=rivals_{source}",
             "versions": {"diagnosis": list_versions()["diagnosis"]},
             "sections": describe_sections(read_rows(rows)),
         }
@@ -156,14 +156,15 @@ def measure_paper(asked: Asked) -> dict[str, object]:
         for name, above, below, paper in _RATIOS
     ]
     stages = {name: version for name, version in list_versions().items() if name in {"extract", "slip"}}
-    return {"command": "make measure ARGS=paper", "versions": stages, "rows": rows, "ratios": ratios}
+    command = "make bench NAME=measure ARGS=paper"
+    return {"command": command, "versions": stages, "rows": rows, "ratios": ratios}
 
 
 def measure_published(_: Asked) -> dict[str, object]:
     """What is said of public recordings with published answers."""
     rows = [{"set": name, **vars(one)} for name, one in ask_sets(PUBLISHED)]
     versions = {name: version for name, version in list_versions().items() if name in {"diagnosis", "slip"}}
-    return {"command": "make published", "versions": versions, "rows": rows}
+    return {"command": "make bench NAME=published", "versions": versions, "rows": rows}
 
 
 def round_interval(row: Mapping[str, float]) -> dict[str, float]:

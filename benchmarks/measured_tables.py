@@ -3,7 +3,8 @@
 What a command measured stands in a file of
 benchmarks/measured: its rows, the command, the commit, the date, and the versions of the program that its
 numbers depend on. A page has the place of a table between two comments, `<!-- measured: NAME -->` and
-`<!-- /measured -->`; without --check what stands between them is written again. `make measure` measures.
+`<!-- /measured -->`; without --check what stands between them is written again.
+`make bench NAME=measure` measures.
 """
 
 import argparse
@@ -299,5 +300,5 @@ def run(asked: argparse.Namespace) -> int:
         for path in sorted(MEASURED.glob("*.json"))
         for what in find_outdated(read_measured(path.stem), list_versions())
     ]
-    sys.stdout.write("".join(f"{one}: make measure\n" for one in outdated))
+    sys.stdout.write("".join(f"{one}: make bench NAME=measure\n" for one in outdated))
     return int(asked.check and bool(differ or outdated))

@@ -1,6 +1,6 @@
 """Public recordings with published or physically known answers: what the program says of each question.
 
-    make published [ARGS="FOLDER"]
+    make bench NAME=published [ARGS="FOLDER"]
 
 The recordings stand in ../shared/published, which is no part of the repository; where they are absent it says
 so. Every answer is read from the ids and numbers of a diagnosis, as `slip.analyze`, `Run.diagnose` and

@@ -39,4 +39,4 @@ def test_the_page_fits_on_two_pages() -> None:
 
 def test_what_is_not_there_is_noticed() -> None:
     names = ["`tests/gone/test_x.py`", "`make nothing`", "`tests/fixtures/verbs.py`"]
-    assert find_missing(f"{', '.join(names)}, `tests/packaging/test_security_page.py`, `make fuzz`") == names
+    assert find_missing(f"{', '.join(names)}, `tests/packaging/test_security_page.py`, `make check`") == names
