@@ -204,7 +204,10 @@ def diagnose_logs(
 def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | None) -> str:
     """The next command: to export an applied model, to add a suggested term, or to apply."""
     if applied is not None:
-        return f"slip model export {shlex.quote(str(applied))} --to ros2_control"
+        from pipeline.words import suggest_export  # noqa: PLC0415 - heavy
+
+        kind = next((one.vehicle.kind for one in runs if one.vehicle is not None), "")
+        return suggest_export(kind, str(applied))
     if suggested := next((one.run for one in runs if one.has_suggestion), None):
         return f"slip serve {shlex.quote(suggested)}    add the suggested term there"
     return applying

@@ -9,7 +9,7 @@ from typing import Any, Never
 
 import numpy as np
 
-from pipeline.core import SILENT_S, Complex, Floats, Ints, join_parts, turn_units
+from pipeline.core import SILENT_S, Complex, Floats, Ints, join_parts, name_first, turn_units
 from pipeline.models import (
     Effect,
     Forward,
@@ -555,7 +555,8 @@ def choose_input(
     """
     known = tuple(effects)
     drivetrain = tuple(dict.fromkeys(effect.id for effect in known if effect.place <= Place.DRIVE))
-    acts = f"{', '.join(drivetrain)} {'act' if len(drivetrain) > 1 else 'acts'} between command and wheels"
+    names = ", ".join(name_first(drivetrain))
+    acts = f"{names} {'act' if len(drivetrain) > 1 else 'acts'} between command and wheels"
     silent = next((run.name for run in runs if run.commands is None), None)
     if asked is not None:
         source, reason = Input(asked), "as requested"

@@ -170,6 +170,8 @@ def require_plausible(label: str, *values: float, least: float = -LARGEST) -> No
 
 
 _FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
+_MOST_GROUNDS = 5
+"""Values by ground that a comment lists; of more it has the least and the largest."""
 _LEAST_FACTOR = 0.01
 """Least ratio of an effective to a nominal length: below it a vehicle hardly moves, and has no parameters."""
 
@@ -477,8 +479,25 @@ class Facts:
         if rivals := self.file.list_rivals(effect.id):
             names = " or ".join(map(quote_name, rivals))
             text += f", undecided: {names} would explain the data as well"
+        if by_ground := self._list_by_ground(label):
+            text += f", the mean of {', '.join(by_ground)}"
         doubt = self.file.find_doubt(effect, parameter)
         return f"{text}, {doubt}" if doubt else text
+
+    def _list_by_ground(self, label: str) -> list[str]:
+        """Values of a parameter that grounds or runs have of their own; of many the least and the largest."""
+        by_run = {
+            str(row.get("run")): value
+            for row in self.file.own_numbers
+            if row.get("parameter") == label and isinstance(value := row.get("value"), float)
+        }
+        grounds = {str(row.get("run")): str(row.get("terrain")) for row in self.file.list_fitted("runs")}
+        values = {(grounds.get(run, run), value) for run, value in by_run.items()}
+        if len(values) != len({ground for ground, _ in values}) or {"None", "unknown"} & {*dict(values)}:
+            values = {*by_run.items()}
+        ranked = sorted(values, key=lambda one: one[1])
+        texts = [f"{value:.4g} on {quote_name(name)}" for name, value in ranked]
+        return texts if len(texts) <= _MOST_GROUNDS else [f"{len(texts)} values, {texts[0]} to {texts[-1]}"]
 
 
 def quote_name(name: str) -> str:

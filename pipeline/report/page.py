@@ -47,7 +47,7 @@ from pipeline.report.sections_why import (
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
 from pipeline.results import has_no_pose, read_findings
 from pipeline.store import Store
-from pipeline.words import describe_regions, format_step, name_span
+from pipeline.words import describe_regions, format_step, name_span, suggest_export
 
 _STEPS_SHOWN = 3
 """Next steps that are shown; the others are folded."""
@@ -214,7 +214,8 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
         steps.append(("Add the suggested term, and see the error fall", f"slip serve {name}"))
     if diagnosis.effects:
         steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
-        steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
+        kind = "" if diagnosis.vehicle is None else diagnosis.vehicle.kind
+        steps.append(("Export it to the controller", suggest_export(kind, "model.toml")))
         against = f"slip model compare model.toml --against literature --on {name}"
         steps.append(("Compare it with models of the literature", against))
         if diagnosis.learned is not None and diagnosis.learned.helps:

@@ -58,7 +58,9 @@ def find_run(text: str, store: Store) -> Manifest:
     if not manifests:
         unread = f"; {len(survey.errors)} cannot be read" if survey.errors else ""
         gone = "" if store.root.exists() else " (the folder of results does not exist)"
-        what = f"{text!r} is neither a log nor a run: no run has been analyzed yet{gone}{unread}"
+        what = f"no run has been analyzed yet{gone}{unread}"
+        if not Path(text).exists():
+            what = f"{text!r} is neither a log nor a run: there is no such file or folder, and {what}"
         raise StoreError("no_such_run", what, where=str(store.root), hint=ANALYZE_FIRST)
     path = spell_location(Path(text).resolve())
     fitting = [

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
         format_recordings,
         format_refusals,
         format_speed_limits,
+        suggest_export,
     )
     from pipeline.words.objects import diagnosis_as_json
     from pipeline.words.verdict import format_refusal, format_verdict

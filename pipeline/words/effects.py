@@ -54,10 +54,18 @@ def describe_motion(effect: Named, run: RunDiagnosis) -> str:
 
 
 def describe_clause(effect: Named, run: RunDiagnosis) -> str:
-    """What the vehicle does by an effect, as a clause; empty where its vehicle is unknown, or runs differ."""
-    if run.vehicle is None or effect.own or effect.id not in _list_known():
+    """What the vehicle does by an effect, as a clause; empty where its vehicle is unknown.
+
+    Where runs or grounds have their own values it is a range: `turns at 40 to 52 % of the ideal rate`.
+    """
+    vehicle = run.vehicle
+    if vehicle is None or effect.id not in _list_known():
         return ""
-    return restore_known(effect.id, effect.parameters).describe_clause(run.vehicle, _list_beside(run))
+    values = [effect.parameters]
+    if effect.own:
+        values = [one for one in effect.by_run if not any(value.is_undetermined for value in one.values())]
+    beside = _list_beside(run)
+    return _join_range([restore_known(effect.id, one).describe_clause(vehicle, beside) for one in values])
 
 
 @lru_cache(maxsize=8)
@@ -69,6 +77,25 @@ def _read_effects(model: str) -> tuple[Effect, ...]:
 def _list_beside(run: RunDiagnosis) -> tuple[Effect, ...]:
     """All effects of the model of a diagnosis."""
     return () if run.model is None else _read_effects(run.model)
+
+
+def _join_range(texts: Sequence[str]) -> str:
+    """Texts that differ in one number as one text with its range; empty where they differ otherwise."""
+    rows = [text.split(" ") for text in texts]
+    if len({len(row) for row in rows}) != 1:
+        return ""
+    words, ranges = [], 0
+    for column in zip(*rows, strict=True):
+        if len(set(column)) == 1:
+            words.append(column[0])
+            continue
+        try:
+            low, high = (pick(column, key=float) for pick in (min, max))
+        except ValueError:
+            return ""
+        words.append(f"{low} to {high}")
+        ranges += 1
+    return " ".join(words) if ranges <= 1 else ""
 
 
 def describe_number(effect: str, parameter: str) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 
 from pipeline.core import (
@@ -186,6 +187,15 @@ def format_contest(contest: Contest) -> list[str]:
         said = f"{best[metric].name} has the smallest error of {words}"
         lines.append(f"{said}, not significantly different from {', '.join(tied)}" if tied else said)
     return lines
+
+
+_TARGETS = {"differential": "ros2_control", "ackermann": "autoware", "mecanum": "nav2", "omni": "nav2"}
+"""By the kind of a vehicle: the export that takes most of its effects and needs no other file."""
+
+
+def suggest_export(kind: str, model: str) -> str:
+    """The command that exports the model of a kind of vehicle; other kinds have their numbers as JSON."""
+    return f"slip model export {shlex.quote(model)} --to {_TARGETS.get(kind, 'json')}"
 
 
 def format_refusals(refusals: Mapping[str, str]) -> str:

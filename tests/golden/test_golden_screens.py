@@ -36,6 +36,7 @@ READING = {
         ("results", "verify"),
         ("results", "explain", RUN),
         ("results", "explain", RUN, "slip.g_w"),
+        ("results", "explain", RUN, "effective_track"),
         ("results", "query", "SELECT run, input, subset, samples FROM aggregates ORDER BY input, subset"),
     ],
     "model.txt": [

@@ -156,6 +156,8 @@ WORDS: list[tuple[str, str]] = [
     ("batch schedule field --at noon", "is not a time of day"),
     ("results explain nobody", "field/wide"),
     ("results explain field/wide slip.nothing", "nothing"),
+    ("results explain field/wide slip.modulos", "Did you mean slip.modulus"),
+    ("results explain field/wide terrain", "Say which of: aggregates.terrain"),
     ("results stage extract text.mcap", "text.mcap"),
     ("results stage slip missing", "missing"),
     ("results verify --seed 3", "--seed does nothing by itself. Add --sample, as 5%."),

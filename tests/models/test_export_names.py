@@ -73,6 +73,19 @@ TARGETS = [
 ]
 
 
+def test_a_number_of_several_grounds_names_each() -> None:
+    own = {"snow": 2.5, "tile": 1.9}
+    fit = {
+        **FIT,
+        "runs": [{"run": f"day/{name}", "terrain": name} for name in own],
+        "own": [
+            {"run": f"day/{name}", "parameter": "effective_track.k", "value": k} for name, k in own.items()
+        ],
+    }
+    text = export_model(make(find_effect("effective_track")(k=2.2), fit=fit), "ros2_control")
+    assert "# effective_track.k = 2.2, the mean of 1.9 on 'tile', 2.5 on 'snow'" in text
+
+
 @pytest.mark.parametrize(("target", "kind"), TARGETS)
 @settings(max_examples=8)
 @given(name=NAMES)

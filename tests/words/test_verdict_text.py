@@ -12,13 +12,15 @@ from msgspec.structs import replace
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.models import find_effect, list_effects
+from pipeline.export import export_model
+from pipeline.models import Model, ModelFile, find_effect, list_effects
 from pipeline.results import Errors, RunDiagnosis, Unexplained, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main
-from pipeline.sources import list_presets
+from pipeline.sources import Vehicle, list_presets
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.words.effects import describe_clause
 from pipeline.words.errors import format_remaining_error
+from pipeline.words.models import suggest_export
 from pipeline.words.verdict import format_verdict
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
@@ -54,6 +56,21 @@ def test_a_verdict_says_what_a_suggested_term_would_leave() -> None:
     term = Unexplained(with_formula=Errors(t_mrmse_m=0.05, r_mrmse_rad=0.02))
     suggested = format_verdict(replace(drawn, unexplained=term))
     assert suggested.endswith("explains the rest: a suggested term would leave 5 cm and 1.1 degrees.")
+
+
+def test_what_differs_between_grounds_is_a_range_in_the_verdict() -> None:
+    drawn = draw_diagnosis({"effective_track": {"k": 1.5}}, [(1.0, 0.5), (0.05, 0.02)])
+    (track,) = drawn.effects
+    value = track.parameters["k"]
+    by_run = tuple({"k": replace(value, value=k, low=k, high=k)} for k in (2.0, 1.25, 1.6))
+    verdict = format_verdict(replace(drawn, effects=(replace(track, by_run=by_run),)))
+    assert "The robot turns at 50 to 80 % of the ideal rate; with this in the model" in verdict
+
+
+@pytest.mark.parametrize("vehicle", _PRESETS.values(), ids=_PRESETS)
+def test_the_export_that_is_suggested_takes_the_vehicle(vehicle: Vehicle) -> None:
+    *_, target = suggest_export(vehicle.kind, "robot.toml").split()
+    assert export_model(ModelFile(Model(vehicle, ())), target)
 
 
 def test_a_verdict_is_never_too_long() -> None:
