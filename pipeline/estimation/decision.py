@@ -101,11 +101,6 @@ class Judged:
         """Score with the price of its numbers: smaller is better."""
         return find_cost(self.fit)
 
-    @property
-    def new(self) -> list[Effect]:
-        """Its new effects, fitted."""
-        return [effect for effect in self.fit.state.effects if effect.id in self.added]
-
 
 def find_cost(fit: PartFit) -> float:
     """Minus twice the log-likelihood of a fit, with the price of its numbers and of unusual effects."""
@@ -181,8 +176,7 @@ class Search:
         while other is not None:
             # Models are compared with all that improves them, what is not accepted in the end included.
             before, given = find_cost(extended), self.given
-            small = {one.id for one in other.state.effects if is_too_small(one, self.conditions)}
-            self.given = asked | small
+            self.given = asked | {one.id for one in self._list_small(other)}
             extended, refused = self._extend_all(other)
             if self.budget.is_spent() or not find_cost(extended) < before - EQUAL:
                 self.given = given
@@ -201,8 +195,7 @@ class Search:
                 behind = other.cost - find_cost(current)
                 is_new = behind < EQUAL and not set(other.added) & set(current.ids)
                 # An error of the data sheet, too small for a name, may be as good an explanation as a name.
-                is_possible = not other.refusal or self._is_unnamed(other)
-                if is_new and is_possible and self.replaces(current, other):
+                if is_new and self._is_fine(other) and self.replaces(current, other):
                     rivals.append(Rival(name, other, behind))
                 if self._is_better(other, current):
                     better.append(other)
@@ -218,14 +211,17 @@ class Search:
         while not self.budget.is_spent():
             self.budget.report(self.part.title, current.ids)
             judged, refused = self._extend(current)
-            chosen, small = _choose(judged), _choose([one for one in refused if self._is_unnamed(one)])
+            known = current.ids
+            fine = [*judged, *(one for one in refused if self._is_fine(one))]
+            small = _choose([one for one in fine if self._list_small(one.fit, known)])
+            chosen = _choose([one for one in judged if not self._list_small(one.fit, known)])
             if (
                 small is not None
                 and small.cost < find_cost(current if chosen is None else chosen.fit) - EQUAL
             ):
                 # An effect that is too small for a name, as sampling makes: others would only imitate it.
+                self.given |= {one.id for one in self._list_small(small.fit, known)}
                 current = small.fit
-                self.given |= set(small.added)
                 continue
             better = None if chosen is None else self.prune(chosen.fit)
             if better is None or not find_cost(better) < find_cost(current):
@@ -233,6 +229,7 @@ class Search:
                 better = self._exchange(current)
             if better is None or not find_cost(better) < find_cost(current):
                 break
+            self.given |= {one.id for one in self._list_small(better, current.ids)}
             current = better
         return current, refused
 
@@ -266,11 +263,23 @@ class Search:
         return math.sqrt(LEAST_T**2 + 2.0 * math.log(self.shapes))
 
     def _judge(self, base: PartFit, fit: PartFit, *, is_final: bool) -> Judged:
+        small = self._list_small(fit, base.ids)
+        if set(fit.ids) - set(base.ids) - {one.id for one in small}:
+            # What is too small for a name has none, and keeps what comes with it from none.
+            base = self.fit(base.state.add(*small)) if small else base
         return judge(base, fit, self.conditions, self._least_t, is_final=is_final)
 
-    def _is_unnamed(self, judged: Judged) -> bool:
-        """Whether a model was refused for the size of its new effects alone."""
-        return bool(judged.new) and all(is_too_small(effect, self.conditions) for effect in judged.new)
+    def _list_small(self, fit: PartFit, known: Collection[str] = ()) -> list[Effect]:
+        """Effects of a model, but for the known ones, that only their size keeps from a name."""
+        new = (effect for effect in fit.state.effects if effect.id not in known)
+        return [
+            one for one in new if all(is_too_small(each, self.conditions) for each in _list_acting(fit, one))
+        ]
+
+    def _is_fine(self, judged: Judged) -> bool:
+        """Whether a model is accepted, or refused for the size of its new effects alone."""
+        small = self._list_small(judged.fit, judged.base.ids)
+        return not judged.refusal or (bool(small) and len(small) == len(judged.added))
 
     def fit(self, state: State, noise: Noise | None = None) -> PartFit:
         """The fit from a state; made once."""
@@ -439,7 +448,7 @@ class Search:
             other: the others in the place of one of its effects.
             margin: by how much they must be better than each of them beside it.
         """
-        new = other.new
+        new = [effect for effect in other.fit.state.effects if effect.id not in current.ids]
         if find_cost(self.fit(current.state.add(*new))) < other.cost - EQUAL:
             return False
         parts = new if len(new) > 1 else []
@@ -584,12 +593,7 @@ def _refuse_numbers(
     base: PartFit, fit: PartFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
 ) -> str:
     """Why an effect's numbers do not allow a name, empty where they do; see `judge`."""
-    acting = fit.state.list_as_it_acts(effect)
-    if len(acting) > 1 and effect.late is not None:
-        # Clocks of several runs are told by their differences: what they have in common may be a delay.
-        delays = [one.delay for one in acting]
-        acting.append(effect.of_delay(min(delays) - max(delays)))
-    if not any(is_nameable(one, conditions) for one in acting):
+    if not any(is_nameable(one, conditions) for one in _list_acting(fit, effect)):
         return "its values are not possible"
     t = measure_t(fit, effect, base)
     if t < least_t:
@@ -597,6 +601,16 @@ def _refuse_numbers(
     if is_final and measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
         return "its interval holds no effect"
     return ""
+
+
+def _list_acting(fit: PartFit, effect: Effect) -> list[Effect]:
+    """An effect of a model as it acts in each run, and by how much its delays there differ."""
+    acting = fit.state.list_as_it_acts(effect)
+    if len(acting) > 1 and effect.late is not None:
+        # Clocks of several runs are told by their differences: what they have in common may be a delay.
+        delays = [one.delay for one in acting]
+        acting.append(effect.of_delay(min(delays) - max(delays)))
+    return acting
 
 
 def _is_material(part: Part, change: Floats) -> bool:

@@ -114,6 +114,19 @@ def test_a_lag_that_sampling_makes_has_no_name_and_keeps_a_limit_from_one() -> N
     assert found.final.ids == ("drive_lag",)
 
 
+def test_a_delay_too_small_for_a_name_keeps_none_from_what_comes_with_it() -> None:
+    """Contact friction, which follows late, was as good as the track alone."""
+    encoders = Encoders(rate_hz=20.0, noise_radps=0.003)
+    run = drive(
+        {"effective_track": 1.3, "clock_offset": {"d": 0.025}, "drive_lag": 0.25},
+        seed=1, duration_s=100.0, disturbance=Disturbance(0.01, 0.01), encoders=encoders, imu=None,
+    )  # fmt: skip
+    _, found, _ = search(run)
+    assert found.new == ("effective_track",)
+    assert found.final.ids == ("effective_track", "clock_offset")
+    assert not found.rivals
+
+
 def test_of_two_effects_that_do_the_same_both_are_reported() -> None:
     """Where nothing but turning on the spot was driven, radius and track are one number."""
     made, found, _ = search(drive({"effective_track": 1.3}, program=Program("spins")))
