@@ -5,6 +5,7 @@ They are measured over steps of a tenth of a second, or over those of the poses.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -146,6 +147,8 @@ def compare(one: Floats, other: Floats) -> float:
 
 STEP_S = 0.1
 _Z = 2
+_STEEPEST = math.sqrt(0.5)
+"""Cosine of the angle by which no ground tilts a vehicle: 45 degrees, over both sides of a hill."""
 _PLANES = ((1, 2), (0, 2), (0, 1))
 """Axes of the plane across each axis, the body's own x first where it lies in the plane."""
 
@@ -278,8 +281,8 @@ def _choose_rows(time: Floats, length: float) -> list[int]:
 def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
     """Index of the axis across the plane of motion, its name, and the headings about it.
 
-    The usual axis is z. Another one counts if the body turns about it four times as much, and moves along it
-    least.
+    The usual axis is z. Another one counts if the body turns most about it and moves along it least, and no
+    ground would be so steep about z.
     """
     before = quaternion[:-1] * np.array([-1.0, -1.0, -1.0, 1.0])
     change = rigid.multiply_quaternions(quaternion[1:], before)
@@ -288,7 +291,11 @@ def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]
     apart = min(8, position.shape[0] // 4)
     extent = np.quantile(np.abs(position[apart:] - position[:-apart]), 0.8, axis=0)
     axis = int(np.argmax(turning))
-    if axis != _Z and not (turning[axis] > 4.0 * turning[2] and int(np.argmin(extent)) == axis):
+    # The cosine of the angle by which the body has leant since the first pose.
+    since = rigid.multiply_quaternions(quaternion, quaternion[:1] * np.array([-1.0, -1.0, -1.0, 1.0]))
+    tilted = float(np.quantile(1.0 - 2.0 * (since[:, 0] ** 2 + since[:, 1] ** 2), 0.05))
+    is_steep = tilted < _STEEPEST or extent[_Z] > math.hypot(extent[0], extent[1])
+    if axis != _Z and not (is_steep and int(np.argmin(extent)) == axis):
         axis = _Z
     if axis == _Z:
         yaw = rigid.euler_from_quaternions(quaternion)[2]

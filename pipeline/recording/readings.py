@@ -227,15 +227,16 @@ class Explained:
 
     def sign(self, channel: str) -> int:
         """Sign of the gain of ``ahead``, ``turned`` or ``aside`` where it is clear, else zero."""
-        aside = None if self.aside is None else self.aside[0]
-        one = {"ahead": self.ahead, "turned": self.turned, "aside": aside}[channel]
+        pairs = {"ahead": (self.ahead, self.none[0]), "turned": (self.turned, self.none[1])}
+        if channel == "aside" and self.aside is not None:
+            pairs[channel] = self.aside
+        if channel not in pairs or not self.is_sure:
+            return 0
+        one, none = pairs[channel]
+        # What drives straight on explains nothing of the turning: its noise has either sign.
+        nats = float((one.blocks - none).sum()) / self.motion.moved.size
         # The other sign is what is to be refused: where a vehicle stands, both are as far off.
-        if (
-            one is None
-            or not self.is_sure
-            or abs(one.t[0]) < CLEAR
-            or compare(one.blocks, one.turned) < CLEAR
-        ):
+        if nats < LEAST_NATS or abs(one.t[0]) < CLEAR or compare(one.blocks, one.turned) < CLEAR:
             return 0
         return int(np.sign(one.gains[0]))
 

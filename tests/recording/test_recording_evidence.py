@@ -21,7 +21,7 @@ from pipeline.recording.evidence import (
     rate_command,
 )
 from pipeline.recording.geometry import explain_wheels, measure_controller, measure_geometry
-from pipeline.recording.motion import FEWEST_STEPS, Steps, compare, fit, measure_motion
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Steps, compare, fit, measure_motion
 from pipeline.recording.readings import Held, Reading
 
 
@@ -390,3 +390,29 @@ def test_wheels_that_turn_farther_than_explained_show_no_scale(path: float, scal
         for each, far in zip(gains, (path, 1.0), strict=True)
     )
     assert compare_sides(left, right) == scale
+
+
+def test_wheels_that_roll_straight_on_are_not_exchanged() -> None:
+    """What the noise of their difference had in common with that of the heading had a sign."""
+    drive, rng = draw(5), np.random.default_rng(8)
+    yaw = rng.normal(0.0, 0.002, drive.rows.size)
+    place = np.cumsum(drive.speed)[drive.rows] * STEP + rng.normal(0.0, 0.002, yaw.size)
+    line = replace(drive, place=place + 0j, yaw=yaw)
+    apart = np.diff(rng.normal(0.0, 0.002, yaw.size) - 0.23 * yaw, append=0.0) / (10 * STEP)
+    at, mean = drive.time[drive.rows], drive.speed[drive.rows] / RADIUS
+    made = Reading("sides", "/joint_states", Held(at, mean - apart), Held(at, mean + apart)).explain(
+        measured(tabulate(line))
+    )
+    assert made is not None
+    assert made.turned.t[0] < -CLEAR
+    assert (made.sign("ahead"), made.sign("turned")) == (1, 0)
+
+
+@pytest.mark.parametrize(("turn", "up"), [(0.35, "z"), (1.5, "y")], ids=["hill", "turns"])
+def test_a_straight_hill_is_no_plane_of_motion(turn: float, up: str) -> None:
+    """Up and down a ramp a body turns about y alone, but no farther than ground is steep."""
+    drive = draw(6)
+    pitch = turn * (np.sin(0.3 * drive.time) > 0.0)
+    place = np.cumsum(drive.speed * np.exp(1j * pitch)) * STEP
+    poses = tabulate(replace(drive, place=place[drive.rows], yaw=pitch[drive.rows]), axis=1)
+    assert measured(poses).up == up
