@@ -286,8 +286,11 @@ def _build_panels(source: ExportSource) -> dict[str, object]:
         "Plot!slip": _build_plot(
             "slip modulus [m/s]",
             [
-                *((f"{name_modulus(name)}.data", f"on {name}", theme.INPUT_COLOURS[name]) for name in inputs),
-                *([] if source.model is None else [(f"{RESIDUAL}.data", "left by the model", theme.MODEL)]),
+                *(
+                    (f"{name_modulus(name)}.data", INPUT_WORDS[name], theme.INPUT_COLOURS[name])
+                    for name in inputs
+                ),
+                *([] if source.model is None else [(f"{RESIDUAL}.data", "with the model", theme.MODEL)]),
             ],
         ),
     }

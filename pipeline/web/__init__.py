@@ -16,6 +16,7 @@ the browser knows. They are opened with a separate cookie that follows links and
 """
 
 import hashlib
+import ipaddress
 import math
 import resource
 import secrets
@@ -254,6 +255,8 @@ HEADERS = {
 ADMIT = "admit"
 """Key in a request's state of the callback for a connection that has shown the token."""
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+EVERY_ADDRESS = frozenset({"0.0.0.0", "::"})  # noqa: S104 - compared, not bound
+"""Where a server listens that can be reached at every address of its machine."""
 _HOW_TO_ENTER = (
     "open the workbench with the whole address that `slip serve` printed, the one with ?token= in it; "
     "a script sends the token as `Authorization: Bearer`"
@@ -295,7 +298,8 @@ class Guard:
     Args:
         app: the protected application.
         token: the required token.
-        hosts: allowed host names of the server, without a port.
+        hosts: allowed host names of the server, without a port. With an address that stands for all, any
+            address is allowed: only a name can be made to resolve to this machine.
     """
 
     def __init__(self, app: ASGIApp, token: str, hosts: tuple[str, ...] = LOOPBACK) -> None:
@@ -303,6 +307,7 @@ class Guard:
         self._token = token
         self._page_token = hashlib.sha256(f"pages {token}".encode()).hexdigest()
         self._hosts = frozenset(host.lower() for host in hosts)
+        self._takes_addresses = not EVERY_ADDRESS.isdisjoint(self._hosts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a request, or refuse it."""
@@ -361,7 +366,8 @@ class Guard:
 
     def _check_origin(self, scope: Scope, headers: Mapping[str, str], *, bears: bool) -> str:
         host = headers.get("host", "")
-        if strip_port(host) not in self._hosts:
+        name = strip_port(host)
+        if name not in self._hosts and not (self._takes_addresses and _is_address(name)):
             return "this server does not have that name"
         origin = headers.get("origin")
         if origin is not None and origin.lower() != f"http://{host.lower()}":
@@ -383,6 +389,14 @@ class Guard:
 def _shows_page(scope: Scope) -> bool:
     """Whether a request only opens a stored page of the results."""
     return scope["method"] in _SAFE and is_page(scope["path"].removeprefix("/"))
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
+    except ValueError:
+        return False
+    return True
 
 
 def strip_port(host: str) -> str:

@@ -31,6 +31,7 @@ from pipeline.sources import list_presets
 from pipeline.store import REPORT
 from pipeline.web import (
     ADMIT,
+    EVERY_ADDRESS,
     LOOPBACK,
     Ask,
     Guard,
@@ -469,18 +470,28 @@ def serve(
     token = make_token()
     app = build_app(results, token=token, hosts=hosts, limits=limits, diagnosis=diagnosis)
     warm_bundle()
-    shown = f"[{host}]" if ":" in host else host
+    shown = _find_own_address(host) if host in EVERY_ADDRESS else host
+    shown = f"[{shown}]" if ":" in shown else shown
     notify(f"http://{shown}:{listener.getsockname()[1]}/", token)
     WorkbenchServer(app, raise_open_files()).run(sockets=[listener])
 
 
 def _own_names(host: str) -> tuple[str, ...]:
     """Host names of this machine if the server listens on all addresses."""
-    if host not in {"0.0.0.0", "::"}:  # noqa: S104 - compared, not bound
-        return ()
     name = socket.gethostname().lower()
-    try:
-        addresses = {str(info[4][0]) for info in socket.getaddrinfo(name, None)}
-    except OSError:
-        addresses = set()
-    return (name, f"{name}.local", *(f"[{each}]" if ":" in each else each for each in sorted(addresses)))
+    return (name, f"{name}.local") if host in EVERY_ADDRESS else ()
+
+
+_FAR = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}  # noqa: S104 - likewise
+"""Addresses of documentation, to which nothing is sent: the way to them is that to other machines."""
+
+
+def _find_own_address(host: str) -> str:
+    """The address at which other machines reach this one; the host itself where it has no network."""
+    family, far = _FAR[host]
+    with socket.socket(family, socket.SOCK_DGRAM) as asked:
+        try:
+            asked.connect((far, 9))
+        except OSError:
+            return host
+        return str(asked.getsockname()[0])

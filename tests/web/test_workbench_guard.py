@@ -128,6 +128,25 @@ def test_a_name_that_points_here_from_elsewhere_is_refused(workbench: Workbench,
         assert b"runs" not in body
 
 
+@pytest.mark.parametrize(
+    ("host", "is_let_in"),
+    [
+        ("192.168.7.9:8321", True),
+        ("[fd00::7]:8321", True),
+        ("evil.example", False),
+        ("192.168.7.9.evil", False),
+    ],
+)
+def test_on_all_addresses_a_phone_gets_in_by_any_address_and_no_name_does(
+    host: str, *, is_let_in: bool
+) -> None:
+    asked = {"type": "http", "path": "/api/runs", "method": "GET", "query_string": b"", "server": ("", 8321)}
+    headers = [(b"host", host.encode()), (b"authorization", f"Bearer {TOKEN}".encode())]
+    for hosts, expected in ((("0.0.0.0",), is_let_in), (("127.0.0.1",), False)):  # noqa: S104 - not bound
+        answer = Guard(lambda *_: None, TOKEN, hosts)._answer({**asked, "headers": headers})  # type: ignore[arg-type, return-value]
+        assert (answer is None) is expected
+
+
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "LOCALHOST"])
 def test_the_loopback_by_any_of_its_names_is_let_in(workbench: Workbench, host: str) -> None:
     status, _, _ = workbench.request("GET", "/api/runs", headers={"Host": f"{host}:{workbench.port}"})

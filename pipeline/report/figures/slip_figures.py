@@ -245,7 +245,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
         return None
     shown = find_range(lines.frame, lines.usual)
     residual = [] if scene.main_residual is None else ["model"]
-    colour = figures.series_colour([*scene.slip, *residual], {**INPUT_WORDS, "model": "left by the model"})
+    colour = figures.series_colour([*scene.slip, *residual], {**INPUT_WORDS, "model": "with the model"})
     chart = figures.draw_lines(scene, ["modulus"], shown, colour).properties(
         height=150,
         title=figures.title_panel("slip modulus", "m/s", shown),
