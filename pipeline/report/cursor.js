@@ -16,7 +16,7 @@ const slipCursor = (bar, { moved = () => {} } = {}) => {
   const play = make("button", { type: "button", className: "play" }, "Play");
   const slider = make("input", { type: "range", step: STEP_S, className: "moment-slider", ariaLabel: "moment that all figures show [s]" });
   const speed = make("select", { ariaLabel: "speed of playback" }, ...[1, FASTER].map((times) => make("option", { value: times, selected: times === FASTER }, `${times}×`)));
-  const told = make("output", { className: "moment-said" });
+  const told = make("output", { className: "moment-said", ariaLive: "off" });
   bar.append(play, slider, speed, told);
 
   let now = null;
@@ -94,6 +94,7 @@ const slipCursor = (bar, { moved = () => {} } = {}) => {
 
   const tell = () => {
     if (now === null) {
+      slider.ariaValueText = `${Number(slider.value).toFixed(1)} s`;
       told.textContent = "Point at a figure, or play: all of them show one moment.";
       return;
     }
@@ -106,6 +107,7 @@ const slipCursor = (bar, { moved = () => {} } = {}) => {
     const [here, there] = ["stretch_way", "stretch_arcs"].map((name) => find(name, now));
     if (here && there) parts.push(`model ${(100 * Math.hypot(here.x - there.x, here.y - there.y)).toFixed(0)} cm off`);
     told.textContent = [`${now.toFixed(1)} s`, ...parts.filter(Boolean)].join(" · ");
+    slider.ariaValueText = told.textContent;
   };
 
   const refresh = () => {
@@ -116,7 +118,6 @@ const slipCursor = (bar, { moved = () => {} } = {}) => {
   const show = (t, { told: isTold = true } = {}) => {
     now = t;
     slider.value = t ?? span[0];
-    slider.ariaValueText = `${Number(slider.value).toFixed(1)} s`;
     if (isTold) moved(t);
     if (frame) return;
     frame = requestAnimationFrame(() => {

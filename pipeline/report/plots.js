@@ -94,6 +94,7 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, drawn = () => 
       spec.config.legend.columns = 1;
       squeeze(spec, place.clientWidth);
     }
+    spec.description = place.ariaLabel;
     spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
     const names = namesIn(spec, new Set());
     spec.datasets = Object.fromEntries([...names].map((name) => [name, rowsOf(name)]));
@@ -106,7 +107,9 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, drawn = () => 
       tooltip: { theme: dark.matches ? "dark" : "light", disableDefaultStyle: strict },
       defaultStyle: !strict,
     });
-    // The place around it has a label that says what is drawn.
+    // Vega calls every figure a visualization: the place keeps the label that says what is drawn.
+    place.setAttribute("role", "img");
+    place.removeAttribute("aria-roledescription");
     place.querySelector("svg")?.setAttribute("aria-hidden", "true");
     views.set(id, { place, view: result.view, names, meta: spec.usermeta ?? {}, finalize: () => result.finalize() });
     return result.view;

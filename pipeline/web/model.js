@@ -16,10 +16,10 @@ export const buildModel = (pane) => {
   const open = new Set([...model.querySelectorAll("details[open]")].map((part) => part.className));
   const cards = session.effects.map((effect) => buildCard(pane, effect));
   model.replaceChildren(
-    h("h3", {}, "Model"),
+    h("h2", {}, "Model"),
     ...session.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
     cards.length ? h("ul", { class: "cards" }, cards) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
-    h("h3", {}, "Add an effect"),
+    h("h2", {}, "Add an effect"),
     buildNext(pane),
     buildFormula(pane));
   for (const part of model.querySelectorAll("details")) part.open = open.has(part.className);
@@ -55,7 +55,7 @@ const buildReach = (pane, next) => {
   const { session } = pane.state;
   const fall = next && Math.min(...["t", "r"].map((key) => next.to[key] / session.errors[key] - 1));
   pane.reach.replaceChildren(...(next
-    ? [h("span", {}, "Next: ", h("b", {}, nameEffect(next)), ` ${sayShare(fall)}`), h("button", { type: "button", class: "add", "aria-label": `add ${next.id} now`, onclick: () => addRow(pane, next) }, "Add")]
+    ? [h("span", {}, "Next: ", h("b", {}, nameEffect(next)), ` ${sayShare(fall)}`), h("button", { type: "button", class: "add", "aria-label": `add ${nameEffect(next)} now`, onclick: () => addRow(pane, next) }, "Add")]
     : [h("span", { class: session.done ? "done" : "" }, session.remains)]));
 };
 
@@ -184,7 +184,7 @@ const buildRow = (pane, row, first) => {
       row.sentence || row.formula.length ? h("span", { class: "quiet about" }, lead(about)) : null,
       h("span", { class: "falls" }, `${change("position", "t", sayLength)}, ${change("heading", "r", sayAngle)}`),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
-    h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, data: { keep: `add ${row.id}` }, onclick: () => addRow(pane, row) }, "Add"));
+    h("button", { type: "button", class: "add", "aria-label": `add ${nameEffect(row)}`, data: { keep: `add ${row.id}` }, onclick: () => addRow(pane, row) }, "Add"));
 };
 
 const tellNothing = (session, diagnosis) => {

@@ -245,7 +245,7 @@ export class Pane {
     place.hidden = Boolean(this.state.run.refusal);
     place.classList.toggle("done", done);
     const span = done ? null : this.largest;
-    place.replaceChildren(remains, ...(span ? [`; largest from ${span.map(Math.round).join(" to ")} s: `, h("button", { type: "button", class: "look", data: { keep: "look" }, onclick: () => this.look(span) }, "look")] : []));
+    place.replaceChildren(remains, ...(span ? [`; largest from ${span.map(Math.round).join(" to ")} s: `, h("button", { type: "button", class: "look", "aria-label": `look at ${span.map(Math.round).join(" to ")} s`, data: { keep: "look" }, onclick: () => this.look(span) }, "look")] : []));
   }
 
   // The half minute that holds a span, drawn large, with the span marked and the cursor at its beginning.

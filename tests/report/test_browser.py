@@ -2,8 +2,10 @@
 
 import base64
 import hashlib
+import html
 import json
 import queue
+import re
 import subprocess
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -51,6 +53,8 @@ PROBE = """
     await wait(() => !document.querySelector(".plot:not(.drawn)"));
     seen.drawn = Object.fromEntries([...document.querySelectorAll("[data-figure]")].map(
       (place) => [place.dataset.figure, place.querySelectorAll("svg path").length]));
+    seen.labels = Object.fromEntries([...document.querySelectorAll("[data-figure]")].map(
+      (place) => [place.dataset.figure, `${place.role}: ${place.ariaLabel}`]));
     seen.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
     seen.outside = outside();
     seen.scrolled = [...document.querySelectorAll(".table")].map(
@@ -155,6 +159,11 @@ def test_every_figure_is_drawn(seen: dict[str, object]) -> None:
     assert isinstance(drawn, dict)
     assert set(drawn) == set(list_places())
     assert min(drawn.values()) > 3
+
+
+def test_every_drawn_figure_says_to_a_screen_reader_what_it_shows(page: str, seen: dict[str, object]) -> None:
+    figures = re.findall(r'data-figure="([\w-]+)" role="img" aria-label="([^"]*)"', page)
+    assert seen["labels"] == {name: f"img: {html.unescape(words)}" for name, words in figures}
 
 
 def test_only_the_answer_is_open_at_first(seen: dict[str, object]) -> None:
