@@ -126,8 +126,11 @@ def format_split(drivetrain: float, ground: float, cross: float) -> str:
         cross: share of twice their product.
     """
     if max(drivetrain, ground) <= 1.0:
-        shares = zip(("drivetrain", "ground", "both together"), (drivetrain, ground, cross), strict=True)
-        return ", ".join(f"{name} {format_share(share, 0)}" for name, share in shares)
+        parts = {"drivetrain": drivetrain, "ground": ground}
+        parts["where they cancel" if cross < 0.0 else "where they add up"] = cross
+        return ", ".join(f"{name} {format_share(share, 0)}" for name, share in parts.items()).replace(
+            "-", "\u2212"
+        )
     one, two = (format_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"
 

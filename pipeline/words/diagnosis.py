@@ -438,10 +438,10 @@ def format_learned_share(run: RunDiagnosis) -> str:
     Where there are encoders, it is learned between wheels and body.
     """
     learned = run.learned
-    scope = "from wheels to body, " if run.by_path else ""
+    scope = "between wheels and body, " if run.by_path else ""
     if learned is None or not learned.helps:
         reason = None if learned is None else learned.reason
-        return f"{scope}a learned term does not help: {reason}" if reason else ""
+        return f"{scope}a function learned from the data does not help: {reason}" if reason else ""
     # Below the noise floor a share is of nothing.
     known = {
         ERRORS_OVER_2S[name][0]: one
@@ -450,14 +450,14 @@ def format_learned_share(run: RunDiagnosis) -> str:
     }
     if not known:
         return ""
-    removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
-    with_learned = " and ".join(format_share(one.with_learned) for one in known.values())
+    learns = "a function learned from the data, which names no cause,"
     if not run.effects:
         shares = [f"{format_share(one.with_learned)} of the {words} error" for words, one in known.items()]
-        learns = "a function learned from the data, which names no cause, removes"
-        return f"{scope}above the noise floor, {learns} {enumerate_texts(shares)}"
-    beyond = f"with a function learned from the data, which names no cause, {with_learned}"
-    return f"{scope}above the noise floor, the effects remove {' and '.join(removed)}; {beyond}"
+        return f"{scope}{learns} would remove {enumerate_texts(shares)} above the noise floor"
+    removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
+    with_learned = enumerate_texts([format_share(one.with_learned) for one in known.values()])
+    effects = f"the effects remove {enumerate_texts(removed)} above the noise floor"
+    return f"{scope}{effects}; with {learns} {with_learned}"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:

@@ -145,16 +145,20 @@ def test_motion_that_lasts_is_one_short_sentence() -> None:
 def test_without_effects_a_learned_term_stands_beside_none() -> None:
     share = {"t_mrmse_m": LearnedShare(0.0, 0.66), "r_mrmse_rad": LearnedShare(0.0, 0.02)}
     text = format_learned_share(RunDiagnosis(learned=Learned(helps=True, explained_share=share)))
-    assert text.endswith("removes 66 % of the position error and 2 % of the heading error")
+    assert text.endswith(
+        "would remove 66 % of the position error and 2 % of the heading error above the noise floor"
+    )
     assert "the effects" not in text
 
 
 def test_a_learned_term_is_said_of_the_path_that_it_was_learned_on() -> None:
     learned = Learned(reason="the remaining error is at the noise floor")
     run = RunDiagnosis(learned=learned)
-    assert format_learned_share(run) == f"a learned term does not help: {learned.reason}"
+    assert format_learned_share(run) == f"a function learned from the data does not help: {learned.reason}"
     both = replace(run, by_path={"wheels": PathLadder()})
-    assert format_learned_share(both).startswith("from wheels to body, a learned term does not help")
+    assert format_learned_share(both).startswith(
+        "between wheels and body, a function learned from the data does"
+    )
 
 
 @pytest.mark.parametrize(
