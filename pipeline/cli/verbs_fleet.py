@@ -38,6 +38,7 @@ from pipeline.core import (
     format_count,
     format_digits,
     format_interval,
+    format_length,
     suffix_unit,
 )
 
@@ -382,6 +383,8 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
         f"{words:<{width}}{_format_interval(cast('Mapping[str, object]', content[key]), unit)}"
         for key, words, unit in _WORDS
     ]
+    if any(cast("Mapping[str, object]", content[key])["low"] is None for key, *_ in _WORDS):
+        lines.append("no intervals: they need three runs")
     return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
 
 
@@ -397,7 +400,9 @@ def _format_expected(number: Mapping[str, object], parameter: ModelParameter) ->
 def _format_interval(number: Mapping[str, object], unit: str) -> str:
     value, low, high = (cast("float", number[key]) for key in ("value", "low", "high"))
     if number["low"] is None:
-        return f"{value:.3g}{suffix_unit(unit)} (no interval: fewer than three runs)"
+        return format_length(value) if unit == "m" else f"{value:.3g}{suffix_unit(unit)}"
+    if unit == "m" and value < 1.0:
+        return format_interval(100.0 * value, 100.0 * low, 100.0 * high, "cm")
     return format_interval(value, low, high, unit)
 
 

@@ -280,7 +280,7 @@ def _advise(
             needs[question.text] = "drive by hand on a slope, in several directions"
         elif _answers(one, room):
             is_alone = len(best.gains) == 1 or SUGGESTION in question.effects
-            alone = f"plan for it alone, --for {question.effects[0]}"
+            alone = f"needs a drive of its own: slip plan --for {question.effects[0]}"
             needs[question.text] = "give more --time" if is_alone else alone
         elif _answers(one, np.ones(room.size)):
             needs[question.text] = "give a larger --area"

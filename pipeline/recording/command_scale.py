@@ -93,25 +93,21 @@ def _explain_scale(
     """One factor on the whole command, or the geometry of another vehicle where that contradicts turns."""
     forward, turning = ratios
     scales, other = (forward, forward), None
-    text = f"in slow driving the wheels turn {forward:.2f} times as fast as commanded"
+    seen = f"in slow driving the wheels turn {forward:.2f} times as fast as commanded"
     if turning <= 0.0 or abs(np.log(turning / forward)) >= _SCALED:
-        text += f", and in turns their difference is {turning:.2f} times the commanded one (median)"
+        seen += f", in turns their difference is {turning:.2f} times the commanded one (median)"
         if not body_commanded and turning > 0.0:
             scales, other = _find_geometry(scales, turning, vehicle)
         if other is None:
-            text += ": no single scale fits, and slip from commands in turns depends on the scale"
+            seen += ": no single scale fits, and slip from commands in turns depends on it"
     if other is None:
-        text += (
-            ": the recorded command is in another scale (another vehicle's wheel radius, a unit, or a gain "
-            f"of the drive); commands are multiplied by {forward:.2f}"
-        )
+        cause = "in another scale (another vehicle's wheel radius, a unit, or a gain of the drive)"
+        done = f"commands are multiplied by {forward:.2f}"
     else:
-        text += (
-            f": the recorded command was made for a wheel radius of {other.wheel_radius_m:g} m and a track "
-            f"of {other.track_width_m:g} m, as of {other.name}; the mean of the sides is multiplied by "
-            f"{scales[0]:.2f} and their difference by {scales[1]:.2f}"
-        )
-    text += " before all other steps, also for models and exports"
+        sizes = f"wheel radius {other.wheel_radius_m:g} m, track {other.track_width_m:g} m"
+        cause = f"that of another vehicle ({other.name}: {sizes})"
+        done = f"corrected (mean of the sides times {scales[0]:.2f}, their difference times {scales[1]:.2f})"
+    text = f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
     finding = Finding("command_scale", "warning", text, where="command", value=scales[0])
     return replace(neutral, command_scale=scales[0], command_turn_scale=scales[1]), (finding,)
 
