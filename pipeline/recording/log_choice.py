@@ -499,21 +499,27 @@ def _compare(
                 "record a localization (lidar, camera, satellites, motion capture)"
             )
             findings.append(Finding("pose_from_wheels", "error", text, where="pose"))
-        elif ratings and ratings[0].from_wheels:
+        useless = ratings[0].refusal if ratings and ratings[0].stands else ""
+        if ratings and ratings[0].from_wheels and not ratings[0].same_as:
+            useless = (
+                "they are wheel odometry, not a localization: computed from the wheels, they say nothing of "
+                "the ground"
+            )
+        sources = replace_pose(sources, ratings)
+        if useless:
+            alone = _let_wheels_stand_in(
+                replace(chosen, sources=replace(sources, pose=None)), index, configuration
+            )
+            if alone.recording is not None:
+                text = f"not used: the poses of {ratings[0].source}: {useless}"
+                unused = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
+                return replace(alone, findings=(*alone.findings, unused))
+        if useless and ratings[0].from_wheels:
             text = (
                 "the pose comes from the wheels, so forward slip is not observable: "
                 f"{ratings[0].source} is computed from them, and the log has no other pose"
             )
             findings.append(Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)))
-        sources = replace_pose(sources, ratings)
-        if ratings and ratings[0].stands:
-            alone = _let_wheels_stand_in(
-                replace(chosen, sources=replace(sources, pose=None)), index, configuration
-            )
-            if alone.recording is not None:
-                text = f"not used: the poses of {ratings[0].source}: {ratings[0].refusal}"
-                still = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
-                return replace(alone, findings=(*alone.findings, still))
     recording = examine(replace(given, sources=sources))
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])

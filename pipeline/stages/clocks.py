@@ -410,7 +410,7 @@ def _flag_placed(topic: str, count: int) -> Finding:
 def _mend_jumps(
     topic: str, header: Stamps, log_time: Stamps
 ) -> tuple[Stamps, tuple[int, ...], list[Finding]]:
-    """Shift each stretch of constant clock offset onto the longest one."""
+    """Shift each stretch of constant clock offset onto the longest one without stamps of the future."""
     if header.size < 2:  # noqa: PLR2004 - one message shows no jump
         return header, (), []
     offset = header - log_time
@@ -418,30 +418,34 @@ def _mend_jumps(
     is_early = (header < DAY_NS) & (np.median(header) > DAY_NS)
     early, known = np.flatnonzero(is_early), np.flatnonzero(~is_early)
     passed, recorded = np.diff(header[known]), np.diff(log_time[known])
-    usual = float(np.median(passed)) if passed.size else 0.0
+    period = float(np.median(passed)) if passed.size else 0.0
     # Messages that a busy recorder writes late have their usual stamps: only the log times jump.
-    jumped = np.abs(passed - usual) >= np.abs(recorded - usual)
-    candidates = np.flatnonzero(
-        ((np.abs(np.diff(offset[known])) > timing.JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
+    jumped = np.abs(passed - period) >= np.abs(recorded - period)
+    # A delay that ends takes stamps forward, too, but to no time after that of their recording.
+    is_far = np.abs(np.diff(offset[known])) > np.where(
+        _is_future(offset[known[:-1]], offset[known[1:]]), _BACKWARD_NS, timing.JUMP_NS
     )
+    candidates = np.flatnonzero((is_far & jumped) | (passed < -_BACKWARD_NS))
     edges = [0]
     for index in candidates:
         before = np.median(offset[known[max(edges[-1], index + 1 - _AROUND) : index + 1]])
         after = np.median(offset[known[index + 1 : index + 1 + _AROUND]])
         moved = after - before
-        if abs(moved) > timing.JUMP_NS or moved < -_BACKWARD_NS:
+        least = _BACKWARD_NS if _is_future(before, after) else timing.JUMP_NS
+        if moved > least or moved < -_BACKWARD_NS:
             edges.append(int(index) + 1)
     edges.append(known.size)
     spans = [known[a:b] for a, b in itertools.pairwise(edges)]
-    home = float(np.median(offset[max(spans, key=len)]))
+    usual = [float(np.median(offset[span])) for span in sorted(spans, key=len, reverse=True)]
+    right = next((one for one in usual if one <= _EARLY_NS), usual[0])
     stamp = header.copy()
     findings: list[Finding] = []
     largest, jumps = 0.0, 0
     if early.size:
-        stamp[early] += round(home - float(np.median(offset[early])))
+        stamp[early] += round(right - float(np.median(offset[early])))
         findings.append(_flag_placed(topic, early.size))
     for span in spans:
-        shift = home - float(np.median(offset[span]))
+        shift = right - float(np.median(offset[span]))
         if abs(shift) < _BACKWARD_NS:
             continue
         stamp[span] += round(shift)
@@ -460,6 +464,11 @@ def _mend_jumps(
     if early.size and early[-1] + 1 < header.size:
         breaks = sorted({*breaks, int(log_time[early[-1] + 1])})
     return stamp, tuple(breaks), findings
+
+
+def _is_future(before: Ints | float, after: Ints | float) -> Flags | bool:
+    """Whether offsets of stamps [ns] lead from what was recorded after its stamp to what was before it."""
+    return (before <= _EARLY_NS) & (after > _EARLY_NS)
 
 
 def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:

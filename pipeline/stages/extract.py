@@ -45,6 +45,7 @@ from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.findings import Finding, StageError, blame_damage
 from pipeline.stages.pose_topics import Cut, read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
+from pipeline.stages.tilt import lean
 from pipeline.stages.trust import check_echo
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
@@ -350,6 +351,7 @@ class Extraction:
                 "sensor that is mounted upside down): its frame was turned over about the x axis"
             )
             self.findings.append(Finding("body_upside_down", "warning", text, where=source.topic))
+        position, quaternion = self._lean(source, times, position, quaternion)
         recorded = (times, position, quaternion, breaks, self.configuration.velocity, source.topic)
         if self.cut is None or not self.cut.is_of(recorded):
             self.cut = Cut(recorded, pose_topics.cut_track(*recorded))
@@ -369,6 +371,25 @@ class Extraction:
                 "active": is_inside(times, spans),
             }
         )
+
+    def _lean(
+        self, source: PoseSource, times: Floats, position: Floats, quaternion: Floats
+    ) -> tuple[Floats, Floats]:
+        """Positions and quaternions, those in the plane with the slopes that an IMU tells."""
+        imu = self._timed(self.sources.imu.topic) if self.sources.imu and source.wheels is None else None
+        if imu is None:
+            return position, quaternion
+        turn = pose_topics.find_turn(self.data.topics, reading.frame_of(imu.columns))
+        leaning = lean(times, position, quaternion, imu, turn)
+        if leaning is None:
+            return position, quaternion
+        position, quaternion, steepest = leaning
+        text = (
+            f"the poses of {source.topic} know no slope: roll, pitch and height are by the orientations of "
+            f"{imu.columns.topic}, up to {np.degrees(steepest):.0f} degrees"
+        )
+        self.findings.append(Finding("slope_by_imu", "info", text, where="pose", value=steepest))
+        return position, quaternion
 
     def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
         """Stamps, log times and poses of base_link in time order, and clock jumps."""

@@ -244,8 +244,8 @@ def list_wanted(
         imu = find_type(types[sources.imu.topic]).imu
         if imu is not None:
             names = [*axis_fields(imu.rate, "xyz"), *axis_fields(imu.force, "xyz")]
-            if imu.orientation and any(_is_by_satellites(source) for source in every):
-                names += axis_fields(imu.orientation, "xyzw")
+            if imu.orientation:
+                names += [*axis_fields(imu.orientation, "xyzw"), *filter(None, [imu.frame])]
             signals += [Signal(sources.imu.topic, name) for name in names]
     if sources.power is not None:
         signals += [
@@ -264,10 +264,6 @@ def list_wanted(
         for topic, fields in by_topic.items()
     ]
     return wanted + _list_wanted_transforms(every, types)
-
-
-def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
-    return isinstance(source, PoseSource) and source.content in {PoseContent.FIX, PoseContent.VELOCITY}
 
 
 def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:

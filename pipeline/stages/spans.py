@@ -33,12 +33,13 @@ from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal
 
 Kind = Literal[
-    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",
-    "rotated", "lost",
+    "emergency_stop", "side_stopped", "manual_driving", "pushed", "commands_silent", "stuck",
+    "localization_frozen", "rotated", "lost",
 ]  # fmt: skip
 
 _MEANS: Mapping[str, str] = {
     "emergency_stop": "the vehicle stood still under live commands: an emergency stop, or the drive was off",
+    "side_stopped": "the wheels of one side stood under live commands: one was stuck, or its motor off",
     "manual_driving": "the vehicle drove without a command: by joystick or another controller",
     "pushed": "the body moved while its wheels stood still: it was pushed or carried, or slid",
     "commands_silent": "commands stopped arriving and the vehicle stopped: a watchdog, or a lost connection",
@@ -176,7 +177,7 @@ def find_spans(
         nothing = np.zeros(times.size, dtype=bool)
         return Spans(nothing, nothing)
     blocks = _Blocks(rims.times)
-    spans, findings = _compare_command(rims, blocks, hold_s)
+    spans, findings = _compare_command(rims, blocks, vehicle, hold_s)
     if rims.driven is not None:
         spans += _compare_wheels(rims, blocks, poses)
     spans.sort(key=lambda one: one.start)
@@ -366,6 +367,16 @@ class _Fit:
         follows = self.likelihood(self.expected)[:, None]
         return np.where(self.is_judged[:, None], made - follows, 0.0)
 
+    def compare_sides(self) -> Floats:
+        """The same if one side stands and the other one follows, for the right and the left, shape (m, 2)."""
+        follows, (ahead, aside, turned) = self.likelihood(self.expected), self.expected.T
+        rims = (0.5 * (ahead - turned), 0.5 * (ahead + turned))
+        made = [
+            self.likelihood(np.column_stack((rim, aside, sign * rim)))
+            for rim, sign in zip(rims, (-1, 1), strict=True)
+        ]
+        return np.where(self.is_judged[:, None], np.column_stack(made) - follows[:, None], 0.0)
+
 
 def _fit(
     blocks: _Blocks, source: Floats, target: Floats, is_known: Flags, *, is_command: bool
@@ -437,7 +448,9 @@ def _moves_otherwise(
     return min(likelihoods) > blocks.price
 
 
-def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple[list[Span], list[Finding]]:
+def _compare_command(
+    rims: Rims, blocks: _Blocks, vehicle: Vehicle, hold_s: float | None
+) -> tuple[list[Span], list[Finding]]:
     """Spans in which the wheels, or the body without encoders, do not follow the command."""
     measured = rims.moved if rims.driven is None else rims.driven
     known = blocks.hold_all(np.column_stack((rims.is_known, np.isfinite(measured))))
@@ -477,9 +490,12 @@ def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple
             )
         elif hold_s is not None:
             spans += _list_silent(rims, blocks, fit, asked + last, pauses, hold_s)
-    for one in _list_contradictions(blocks, fit, asked):
+    has_sides = rims.driven is not None and vehicle.kinematics.has_inputs("left", "right")
+    for one in _list_contradictions(blocks, fit, asked, has_sides=has_sides):
         if one.motion == "stands" and one.is_driven:
             spans.append(Span("emergency_stop", one.start, one.end, one.nats))
+        elif one.motion == "stands on one side" and one.is_driven:
+            spans.append(Span("side_stopped", one.start, one.end, one.nats))
         elif not one.is_driven:
             spans.append(Span("manual_driving", one.start, one.end, one.nats))
     return spans, findings
@@ -492,7 +508,8 @@ class _Contradiction(NamedTuple):
         start, end: [s].
         nats: gain in log-likelihood.
         is_driven: whether the source moves.
-        motion: ``stands``, ``turned`` (of the usual length), ``longer`` or ``shorter``: the likeliest.
+        motion: ``stands``, ``stands on one side``, ``turned`` (of the usual length), ``longer`` or
+            ``shorter``: the likeliest.
     """
 
     start: float
@@ -502,14 +519,18 @@ class _Contradiction(NamedTuple):
     motion: str
 
 
-def _list_contradictions(blocks: _Blocks, fit: _Fit, source: Floats) -> list[_Contradiction]:
+def _list_contradictions(
+    blocks: _Blocks, fit: _Fit, source: Floats, *, has_sides: bool = False
+) -> list[_Contradiction]:
     gains, made = fit.compare(), []
+    halves = fit.compare_sides() if has_sides else gains[:, :0]
     size = np.abs(source).sum(axis=1)
     for _, part in follow_likeliest(gains[:, 2:], blocks.price):
         stands, free, mixed, turned = gains[part].T
         moved, usual = (np.hypot(one[part, 0], one[part, 1]).sum() for one in (fit.target, fit.expected))
         free_as = "longer" if moved > usual else "shorter"
         sums = {"stands": stands.sum(), free_as: free.sum(), "turned": turned.sum()}
+        sums["stands on one side"] = max(halves[part].sum(axis=0), default=-np.inf)
         # Where it shows, not where both stand.
         shown = np.maximum(np.maximum(mixed, turned), 0.0)
         made.append(

@@ -163,3 +163,22 @@ def test_the_whole_program_needs_little_memory_when_a_clock_is_set(odd: Scenario
         assert run["log"]["duration_s"] == pytest.approx(60.0, abs=0.5)
         answers.append({effect["id"] for effect in run["diagnosis"]["effects"]})
     assert answers[0] == answers[1]
+
+
+@pytest.mark.parametrize(
+    ("ahead_ms", "late_ms", "is_set"),
+    [((0, 300), (30, 30), True), ((300, 0), (30, 30), True), ((0, 0), (400, 30), False)],
+    ids=["ahead", "back", "a delay ends"],
+)
+def test_a_clock_that_is_set_ahead_by_less_than_delays_shows_by_stamps_of_the_future(
+    ahead_ms: tuple[int, int], late_ms: tuple[int, int], *, is_set: bool
+) -> None:
+    """A track of 1.3 was named 1.6 beside a clock that was set ahead by half a second."""
+    moment = START + np.arange(600) * SECOND // 10
+    first = np.arange(600) < 250
+    header = moment + np.where(first, *ahead_ms) * 10**6
+    log = moment + np.where(first, *late_ms) * 10**6
+    clocks, findings = align_clocks({"pose": Recorded("/pose", log, log, header)})
+    right = moment if is_set else header
+    assert (clocks["pose"].stamp == right).all()
+    assert {one.id for one in findings} == ({"clock_jump"} if is_set else set())

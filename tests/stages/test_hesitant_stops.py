@@ -56,3 +56,26 @@ def test_segments_that_overlap_where_the_poses_jump_hide_no_stop() -> None:
     assert kind == "emergency_stop"
     assert abs(start - 50.0) < 1.0
     assert abs(end - 58.0) < 1.0
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0], ids=["left", "right"])
+def test_a_side_that_stands_while_the_other_one_follows_is_told_and_left_out(side: float) -> None:
+    """A stuck wheel made all turning of the run an unknown effect."""
+    vehicle, rng = find_preset("husky_a200"), np.random.default_rng(3)
+    assert vehicle is not None
+    times, half = np.arange(0.0, 120.0, STEP_S), 0.5 * vehicle.track_width_m
+    number = (times // 2.5).astype(int)
+    asked = np.column_stack(
+        (rng.uniform(0.2, 0.8, 60)[number], 0.0 * times, rng.uniform(-0.8, 0.8, 60)[number])
+    )
+    stuck = (times >= 60.0) & (times < 75.0)
+    rim = 0.5 * (asked[:, 0] - side * half * asked[:, 2])
+    driven = np.where(stuck[:, None], np.column_stack((rim, 0.0 * rim, -side * rim / half)), asked)
+    flags = np.zeros(times.size, dtype=bool)
+    inputs = {"command": Ideal(asked, flags, ~flags), "measured": Ideal(driven, flags, ~flags)}
+    velocities = pl.DataFrame(dict(zip(("t", "v_x", "v_y", "v_w"), (times, *driven.T), strict=True)))
+    poses = pl.DataFrame({"t": times, "held": flags})
+    (told,) = find_spans(velocities, poses, inputs, vehicle, 0.5).incidents
+    assert told.kind == "side_stopped"
+    assert abs(told.start - 60.0) < 1.0
+    assert abs(told.end - 75.0) < 1.0

@@ -67,7 +67,8 @@ def test_a_position_that_never_changes_while_the_heading_lives_is_refused(
     assert "never changes while its heading turns" in rating.refusal
 
 
-def test_a_pose_of_the_wheels_alone_is_said_loudly(tmp_path: Path) -> None:
+def test_beside_a_pose_of_the_wheels_alone_the_drive_is_observed_and_no_ground(tmp_path: Path) -> None:
+    """Nothing at all was said of the drive that is named where no pose is recorded."""
     scenario = replace(
         FIELD,
         duration_s=40.0,
@@ -75,8 +76,11 @@ def test_a_pose_of_the_wheels_alone_is_said_loudly(tmp_path: Path) -> None:
         recording=Recording("tf"),
     )
     chosen = look(record(scenario, tmp_path))
-    assert chosen.ratings[0].from_wheels
-    assert {(finding.id, finding.severity) for finding in chosen.findings} == {("pose_is_odometry", "error")}
+    told = {finding.id: finding.text for finding in chosen.findings}
+    assert told.keys() == {"ground_unobservable", "numbers_not_used"}
+    assert "wheel odometry, not a localization" in told["numbers_not_used"]
+    assert chosen.sources.pose is not None
+    assert chosen.sources.pose.wheels is not None
 
 
 def test_a_localization_is_never_taken_for_the_wheels(tmp_path: Path) -> None:

@@ -127,11 +127,12 @@ class GroundVelocityFields(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
 
 class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Angular velocity [rad/s] and specific force [m/s^2]; optionally an attitude."""
+    """Angular velocity [rad/s] and specific force [m/s^2]; optionally an attitude, and the sensor's frame."""
 
     rate: str | list[str]
     force: str | list[str]
     orientation: str = ""
+    frame: str = ""
     convention: Convention = "flu"
 
 

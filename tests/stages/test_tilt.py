@@ -1,0 +1,81 @@
+"""Poses in the plane get the slope that an IMU tells, and nothing where it tells none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_drives import (
+    DrawnDrive,
+    DrawnTopic,
+    draw_drive,
+    extract_drawn,
+    read_findings,
+    record_cdr,
+    record_twist,
+    stamp_ros,
+    write_drawn,
+)
+
+from pipeline.core import rigid
+
+
+def record_poses(drive: DrawnDrive, pitch: float = 0.0) -> DrawnTopic:
+    """Poses in the plane, or with pitch up to an angle."""
+    fields = stamp_ros(drive) | drive.pose("pose.") | {"header.frame_id": "map"}
+    leaning = rigid.quaternions_from_euler(0.0 * drive.yaw, pitch * np.sin(drive.time), drive.yaw)
+    fields |= {f"pose.orientation.{name}": leaning[:, i] for i, name in enumerate("xyzw")}
+    return record_cdr(drive, "/amcl/pose", "geometry_msgs/msg/PoseStamped", fields)
+
+
+def record_imu(drive: DrawnDrive, slope: float, *, turned: bool = False) -> DrawnTopic:
+    """Orientations on a plane that rises to the north, in an IMU that looks ahead, or to the left."""
+    normal = np.array([0.0, -np.sin(slope), np.cos(slope)])
+    # In the frame of the heading, which is of a magnetometer that is a radian off.
+    ahead, left = normal[1] * np.sin(drive.yaw), normal[1] * np.cos(drive.yaw)
+    roll, pitch = np.arctan2(-left, normal[2]), np.arctan2(ahead, np.hypot(left, normal[2]))
+    body = rigid.quaternions_from_euler(roll, pitch, drive.yaw + 1.0)
+    if turned:
+        quarter = np.array([[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]])
+        body = rigid.multiply_quaternions(body, quarter)
+    fields = stamp_ros(drive) | {"header.frame_id": "imu_link", "angular_velocity.z": drive.turn}
+    fields |= {f"orientation.{name}": body[:, i] for i, name in enumerate("xyzw")}
+    return record_cdr(drive, "/imu/data", "sensor_msgs/msg/Imu", fields)
+
+
+def record_mounting(drive: DrawnDrive) -> DrawnTopic:
+    count, half = drive.time.size, [float(np.sqrt(0.5))]
+    frames = {"header.frame_id": ["base_link"], "child_frame_id": ["imu_link"]}
+    turn = {"transform.rotation.z": half, "transform.rotation.w": half}
+    fields = {f"transforms[].{name}": [value] * count for name, value in (frames | turn).items()}
+    return record_cdr(drive, "/tf_static", "tf2_msgs/msg/TFMessage", fields)
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["ahead", "turned"])
+def test_slope_and_height_of_poses_in_the_plane_are_those_of_an_imu(*, turned: bool, tmp_path: Path) -> None:
+    drive, slope = draw_drive(60.0), np.radians(12.0)
+    topics = [record_twist(drive), record_poses(drive), record_imu(drive, slope, turned=turned)]
+    topics += [record_mounting(drive)] if turned else []
+    log = write_drawn(tmp_path / "log.mcap", *topics)
+    poses = extract_drawn(log)
+    assert poses["z"].to_numpy() == pytest.approx(np.tan(slope) * (drive.y - drive.y[0]), abs=0.02)
+    quaternion = poses.select("q_x", "q_y", "q_z", "q_w").to_numpy()
+    up = rigid.rotate(quaternion, np.broadcast_to([0.0, 0.0, 1.0], (poses.height, 3)))
+    assert up == pytest.approx(np.broadcast_to([0.0, -np.sin(slope), np.cos(slope)], up.shape), abs=4e-3)
+    assert "up to 12 degrees" in read_findings(log)["slope_by_imu"]
+
+
+@pytest.mark.parametrize(("slope", "pitch"), [(1.0, 0.0), (12.0, 0.1)], ids=["floor", "known"])
+def test_a_floor_stays_level_and_slopes_that_are_known_stay(
+    slope: float, pitch: float, tmp_path: Path
+) -> None:
+    drive = draw_drive(60.0)
+    poses = extract_drawn(
+        write_drawn(
+            tmp_path / "log.mcap",
+            record_twist(drive),
+            record_poses(drive, pitch),
+            record_imu(drive, np.radians(slope)),
+        )
+    )
+    assert (poses["z"] == 0.0).all()
+    assert poses["q_y"].abs().max() < max(pitch, 1e-6)
