@@ -270,7 +270,7 @@ def test_trap_21_commands_of_another_vehicle_are_those_of_its_wheels_and_track(
     effects = {} if reached == 1.0 else {"difference_gain": reached}
     taken = drive(replace(LONGER, effects=effects, recording=recording))
     finding = taken.finding("command_scale")
-    assert "as of Clearpath Warthog" in finding.text
+    assert "another vehicle (Clearpath Warthog: " in finding.text
     assert finding.value == pytest.approx(radii, rel=1e-6)
     aligned = drive(replace(LONGER, effects=effects)).aligned.tables["commands"]
     for side in ("left_aligned", "right_aligned"):
