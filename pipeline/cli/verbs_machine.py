@@ -244,8 +244,7 @@ def _look_at_loops() -> Check:
         where = "beside the installation or in the user's cache"
         hint = "Set NUMBA_CACHE_DIR to a folder that you may write to"
         return Check(name, "problem", f"every process compiles {count} loops: none can be kept {where}", hint)
-    folders = ", ".join(sorted(str(folder) for folder in caches))
-    return Check(name, "ok", f"{count} kept in {folders}")
+    return Check(name, "ok", f"{count} kept in {os.path.commonpath([str(folder) for folder in caches])}")
 
 
 def _look_for_browser() -> Check:

@@ -237,10 +237,10 @@ def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tu
         return name, "--wheel-radius and --track-width give others"
     first, (called, share) = next(iter(alike.items()))
     if abs(share - 1.0) < _SAME_TRACK:
-        return first, f"a {called} has about these: confirm with --vehicle {first}"
+        return first, f"{called} has about these: confirm with --vehicle {first}"
     names = " or ".join(called for called, _ in alike.values())
     turns = f"turns at {format_share(share)} of the ideal rate"
-    return name, f"a {names} has such wheels, and then {turns}: confirm with --vehicle {' or '.join(alike)}"
+    return name, f"{names} has such wheels, and then {turns}: confirm with --vehicle {' or '.join(alike)}"
 
 
 def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | None) -> Geometry:
