@@ -51,6 +51,7 @@ class LogOptions:
 FAULTS = (
     "signs_contradict",
     "command_reversed",
+    "command_of_map",
     "motor_reversed",
     "wheels_reversed",
     "wheel_dead",

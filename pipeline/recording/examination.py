@@ -24,7 +24,7 @@ from pipeline.recording.roles import (
     report_turn,
     settle_stamps,
 )
-from pipeline.recording.signs import report_mounting, report_signs, turn_motion
+from pipeline.recording.signs import report_axes, report_mounting, report_signs, turn_motion
 from pipeline.recording.timeouts import settle_delay, settle_timeout
 from pipeline.recording.units import correct_wheel_unit, find_units, settle_gyro, settle_lengths
 from pipeline.run import GROUND_UNOBSERVABLE, Alignment
@@ -118,6 +118,7 @@ def examine(given: Given) -> Recording:
     readings = [*(drive.reading for drive in drives), *gyros]
     motion = turn_motion(case, motion, readings)
     command, wheels = choose_roles(case, drives)
+    report_axes(case, command)
     settle_stamps(case, command)
     settle_timeout(case, command, wheels, motion)
     report_turn(case, command)

@@ -1,14 +1,15 @@
 """Frame of the poses, where they are on the body, and the signs of the other signals."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.core import enumerate_texts, format_length
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
-from pipeline.recording.motion import CLEAR, Motion, fit
-from pipeline.recording.readings import Reading
+from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare, fit
+from pipeline.recording.readings import DELAYS_S, Reading
 from pipeline.sources import PoseContent
 from pipeline.stages import Finding
 
@@ -108,6 +109,31 @@ def report_signs(
             else:
                 _report_fault(case, fault, command, wheels)
     _report_frame(case, up, 180.0 - (180.0 - offset) % 360.0, signs)
+
+
+def rate_map_axes(reading: Reading) -> float:
+    """Vuong's statistic of commands along the axes of a map against those along the body's; zero of none."""
+    made = reading.explained
+    if made is None or made.across is None:
+        return 0.0
+    along = replace(made.motion, middle=np.zeros(made.motion.middle.size), flip=False, offset_deg=0.0)
+    other = reading.fit_to(along, DELAYS_S, crossed=made.crossed)
+    if other.across is None:
+        return 0.0
+    one, own = other.across[0].blocks, made.across[0].blocks
+    return compare(one, own) if float((one - own).sum()) > LEAST_NATS * along.moved.size else 0.0
+
+
+def report_axes(case: Case, command: Candidate | None) -> None:
+    """Tell commands along the axes of a map, which a base that moves sideways turns by its heading."""
+    margin = 0.0 if command is None else rate_map_axes(command.reading)
+    if command is None or margin < CLEAR:
+        return
+    text = (
+        f"the commands of {command.source} are along the axes of a map, and the base turns them by its "
+        "heading (field-centric driving): record them as they are along the body's own axes"
+    )
+    case.findings.append(Finding("command_of_map", "error", text, where="command", value=margin))
 
 
 def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:

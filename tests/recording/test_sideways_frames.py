@@ -11,8 +11,9 @@ from drawn_motion import STEP, measured
 
 from pipeline.core.arrays import Complex, Floats
 from pipeline.recording.evidence import find_frame
-from pipeline.recording.motion import Motion
+from pipeline.recording.motion import CLEAR, Motion
 from pipeline.recording.readings import Held, Reading
+from pipeline.recording.signs import rate_map_axes
 
 
 def drive(seed: int, *, line: bool = False) -> tuple[Floats, Complex, Floats, Complex, Floats]:
@@ -98,3 +99,15 @@ def test_a_command_that_is_the_same_throughout_says_where_the_body_should_go() -
     assert command.is_constant
     assert command.explained is not None
     assert command.explained.is_sure
+
+
+@pytest.mark.parametrize("of_map", [False, True], ids=["body", "map"])
+def test_commands_along_the_axes_of_a_map_are_told_from_those_of_the_body(*, of_map: bool) -> None:
+    """A formula with the heading in the map was offered for them."""
+    time, asked, rate, _, yaw = drive(5)
+    turned = np.cumsum(0.9 * rate) * STEP
+    place = np.cumsum(0.8 * asked * (1.0 if of_map else np.exp(1j * turned))) * STEP
+    noise = np.random.default_rng(6).normal(0.0, 0.002, (2, yaw.size))
+    command = read(time, asked, rate)
+    command.explain(see(place[::10] + noise[0] + 1j * noise[1], yaw))
+    assert (rate_map_axes(command) > CLEAR) == of_map
