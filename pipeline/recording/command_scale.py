@@ -16,7 +16,7 @@ from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import FEWEST_STEPS
 from pipeline.recording.readings import Held, Reading
 from pipeline.run import STILL_MPS, Alignment
-from pipeline.sources import Vehicle, list_presets
+from pipeline.sources import DriveForm, Vehicle, list_presets
 from pipeline.stages import ONE_SCALE, Finding
 
 _LEAST_RATIO = 0.02
@@ -253,7 +253,10 @@ def measure_command(
         return None
     is_body = command.reading.form == "body"
     alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
-    if case.driven is not None and (case.is_known or not is_body):
+    # Turns of wheels over metres a second are those of their radius.
+    is_rolled = wheels is not None and wheels.source.form is DriveForm.JOINTS
+    is_alike = not is_body and not (is_rolled and command.reading.form == "steering")
+    if case.driven is not None and (case.is_known or is_alike):
         gain, made_of = None, command.reading.explained
         if is_body and made_of is not None and command.sign("ahead") > 0:
             gain = float(made_of.ahead.gains[0]) / case.command_factors()[0]

@@ -343,12 +343,12 @@ class Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
-        position, quaternion = reading.put_upright(arrays, self.configuration.pose)
-        if reading.is_upside_down(quaternion):
-            quaternion = reading.turn_over(quaternion)
+        position, quaternion, leant = reading.put_upright(arrays, self.configuration.pose)
+        if leant:
             text = (
-                f"the body's z axis points down in the poses of {source.topic} (ahead, right, down, or a "
-                "sensor that is mounted upside down): its frame was turned over about the x axis"
+                f"the frame of the poses of {source.topic} leans by {np.degrees(leant):.0f} degrees, as that "
+                "of a camera, or of a sensor that is mounted upside down (ahead, right, down): it was turned "
+                "upright"
             )
             self.findings.append(Finding("body_upside_down", "warning", text, where=source.topic))
         position, quaternion = self._lean(source, times, position, quaternion)

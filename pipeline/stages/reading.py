@@ -378,12 +378,15 @@ _UPRIGHT: Mapping[str, NDArray[np.float64]] = {
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 
 
-def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Floats]:
+def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Floats, float]:
     """Positions and quaternions with z up and the vehicle's x axis ahead, as a configuration says.
 
     Args:
         arrays: poses as recorded.
         section: its ``axes``, ``up``, ``heading_deg`` and ``unit``.
+
+    Returns:
+        These, and the angle [rad] by which a frame leant that was turned upright, else zero.
     """
     up = section.up or ("-z" if section.axes == "ned" else "z")
     position, quaternion = LENGTH_UNITS[section.unit or "m"] * arrays.position, arrays.quaternion
@@ -391,22 +394,42 @@ def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Float
         turn = _UPRIGHT[up.removeprefix("-")] * (_HALF_TURN[:, None] if up.startswith("-") else 1.0)
         position = position @ turn.T
         quaternion = np.column_stack([quaternion[:, :3] @ turn.T, quaternion[:, 3]])
+    leant, lean = 0.0, find_lean(quaternion)
+    if lean is not None:
+        leant = float(np.arccos(np.clip(find_heights(lean), -1.0, 1.0)))
+        quaternion = rigid.multiply_quaternions(quaternion, rigid.invert_quaternions(lean)[None])
     if section.heading_deg:
         half = 0.5 * np.radians(section.heading_deg)
         ahead = np.tile([0.0, 0.0, np.sin(half), np.cos(half)], (quaternion.shape[0], 1))
         quaternion = rigid.multiply_quaternions(quaternion, ahead)
-    return position, quaternion
+    return position, quaternion, leant
 
 
-_DOWN = -0.7
-"""Height of a body's z axis below which it points down: no vehicle leans by 45 degrees in most of a drive."""
+_LEANS = 0.7
+"""Height of a body's z axis below which its frame leans: no vehicle leans by 45 degrees most of the time."""
+_CONSTANT = 0.9
+"""Share of a mean orientation above which it is that of a mounting: turns about another axis have none."""
 
 
-def is_upside_down(quaternion: Floats) -> bool:
-    """Whether the z axis of a body points down in most of its poses, of shape (n, 4)."""
-    upward = 1.0 - 2.0 * (quaternion[:, 0] ** 2 + quaternion[:, 1] ** 2)
-    known = upward[np.isfinite(upward)]
-    return bool(known.size) and float(np.median(known)) < _DOWN
+def find_heights(quaternion: Floats) -> Floats:
+    """Heights of z axes, from -1 to 1, of quaternions of shape (..., 4)."""
+    return np.asarray(1.0 - 2.0 * (quaternion[..., 0] ** 2 + quaternion[..., 1] ** 2))
+
+
+def find_lean(quaternion: Floats) -> Floats | None:
+    """Orientation of a leaning frame on its vehicle, but for a heading, shape (4,); None where it is upright.
+
+    A camera looks ahead along its z axis; a sensor may be mounted upside down.
+    """
+    size = np.linalg.norm(quaternion, axis=1)
+    known = np.isfinite(size) & (size > 0.0)
+    unit = quaternion[known] / size[known, None]
+    if not unit.size or float(np.median(find_heights(unit))) > _LEANS:
+        return None
+    headings = rigid.quaternions_from_yaw(rigid.euler_from_quaternions(unit)[2])
+    mounted = rigid.multiply_quaternions(rigid.invert_quaternions(headings), unit)
+    shares, means = np.linalg.eigh(mounted.T @ mounted / len(mounted))
+    return np.asarray(means[:, -1]) if shares[-1] > _CONSTANT else None
 
 
 def turn_over(quaternion: Floats) -> Floats:

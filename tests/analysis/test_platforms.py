@@ -197,11 +197,12 @@ def test_a_turtlebot_that_does_not_say_so_is_recognized_by_its_geometry(foreign_
     assert chosen.vehicle.track_width_m == pytest.approx(0.287, rel=0.03)
     said = " ".join(finding.text for finding in chosen.findings)
     assert "turtlebot3_waffle" in said
-    assert "forward slip is not observable" in said
+    assert "wheel odometry, not a localization" in said
 
 
 def test_a_recorded_robot_description_tells_the_vehicle(foreign_logs: Path) -> None:
     log = foreign_logs / "nvnmangla_roomba.db3"
     chosen = choose(open_log(log), load_configuration(log), {})
     assert (chosen.vehicle.id, chosen.vehicle_source) == ("turtlebot3_burger", "robot_description")
-    assert chosen.ratings[0].from_wheels
+    assert chosen.sources.pose is not None
+    assert chosen.sources.pose.wheels is not None

@@ -361,3 +361,29 @@ def test_a_version_of_a_type_without_its_currents_is_read_all_the_same(tmp_path:
     setup = set_up(tmp_path, robot.command(), status, robot.pose())
     assert str(setup.sources.wheels).startswith("/scout_status")
     assert setup.sources.power is None
+
+
+def test_the_radius_of_the_wheels_of_an_unknown_car_is_no_scale_of_its_commands(tmp_path: Path) -> None:
+    """Its wheels were said to turn 3.34 times as fast as commanded, and to a drive gain of .3."""
+    drive, radius, wheelbase = draw(31), 0.3, 2.5
+    speed, angle = drive.speed[drive.rows], 0.4 * drive.asked[drive.rows, 1]
+    yaw = np.cumsum(speed * np.tan(angle) / wheelbase) * 0.1
+    place = np.cumsum(speed * np.exp(1j * yaw)) * 0.1
+    does = DrawnDrive(drive.time[drive.rows], speed, 0.0 * yaw, place.real, place.imag, yaw)
+    asked = {"drive.speed": drive.asked[drive.rows, 0], "drive.steering_angle": angle}
+    names = [["rear_left_wheel_joint", "rear_right_wheel_joint", "front_steering_joint"]] * yaw.size
+    joints = stamp_ros(does) | {
+        "name": names,
+        "position": np.column_stack((0.0 * angle, 0.0 * angle, angle)).tolist(),
+        "velocity": np.column_stack((speed / radius, speed / radius, 0.0 * angle)).tolist(),
+    }
+    setup = set_up(
+        tmp_path,
+        record_cdr(does, "/drive", "ackermann_msgs/msg/AckermannDriveStamped", stamp_ros(does) | asked),
+        record_cdr(does, "/joint_states", JOINTS, joints),
+        record_cdr(
+            does, "/ndt_pose", POSE, stamp_ros(does) | does.pose("pose.") | {"header.frame_id": "map"}
+        ),
+    )
+    assert setup.vehicle.wheel_radius_m == pytest.approx(radius, rel=0.05)
+    assert "times as fast as commanded" not in told(setup)

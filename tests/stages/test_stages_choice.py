@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stage_logs import FIELD, PLAIN, TakeThrough
 
+from pipeline.core import rigid
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
 from pipeline.recording.log_choice import Choice, choose
@@ -20,11 +21,25 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.sources import Configuration, DriveSection, find_preset, find_type, load_configuration
+from pipeline.sources import (
+    Configuration,
+    DriveSection,
+    PoseSection,
+    find_preset,
+    find_type,
+    load_configuration,
+)
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints, unwrap_counter
 from pipeline.stages.extract import Given, extract_tables
-from pipeline.stages.reading import find_angle_unit, is_upside_down, list_wanted, read_pose_topic, turn_over
+from pipeline.stages.reading import (
+    PoseArrays,
+    find_angle_unit,
+    find_lean,
+    list_wanted,
+    put_upright,
+    read_pose_topic,
+)
 
 SECOND = 10**9
 COUNT = 600
@@ -155,9 +170,34 @@ def test_a_sensor_that_hangs_upside_down_is_turned_over() -> None:
     zero = np.zeros(half.size)
     upright = np.column_stack([zero, zero, np.sin(half), np.cos(half)])
     hanging = np.column_stack([np.cos(half), np.sin(half), zero, zero])
-    assert is_upside_down(hanging)
-    assert not is_upside_down(upright)
-    assert turn_over(hanging) == pytest.approx(-upright)
+    assert find_lean(upright) is None
+    stood, leant = put_upright(PoseArrays(np.zeros((50, 3)), hanging, "", ""), PoseSection())[1:]
+    assert np.abs((stood * upright).sum(axis=1)) == pytest.approx(1.0)
+    assert leant == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize("down_deg", [0.0, 25.0])
+def test_poses_of_a_camera_are_turned_upright_on_slopes_as_on_level_ground(down_deg: float) -> None:
+    """Headings of a camera that looks down a little were turned about the axis along which it looks."""
+    yaw = np.linspace(-2.0, 4.0, 80)
+    pitch, roll = 0.1 * np.sin(3.0 * yaw), 0.05 * np.cos(2.0 * yaw)
+    body = rigid.quaternions_from_euler(roll, pitch, yaw)
+    looks = rigid.quaternions_from_euler(np.zeros(1), np.radians([down_deg]), np.zeros(1))
+    optical = np.array([[-0.5, 0.5, -0.5, 0.5]])
+    seen = rigid.multiply_quaternions(rigid.multiply_quaternions(body, looks), optical)
+    stood, leant = put_upright(PoseArrays(np.zeros((80, 3)), seen, "", ""), PoseSection(heading_deg=90.0))[1:]
+    found = rigid.euler_from_quaternions(stood)
+    assert np.degrees(leant) == pytest.approx(90.0 + down_deg, abs=1.0)
+    assert np.ptp(np.unwrap(found[2]) - yaw) < 0.02
+    assert found[1] == pytest.approx(pitch, abs=0.02)
+    assert found[0] == pytest.approx(roll, abs=0.02)
+
+
+def test_turns_about_another_axis_are_no_mounting() -> None:
+    """Motion capture with y up: which axis is up, the motion tells."""
+    half = 0.5 * np.linspace(-3.0, 3.0, 80)
+    zero = np.zeros(half.size)
+    assert find_lean(np.column_stack([zero, np.sin(half), zero, np.cos(half)])) is None
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.4, 3.0])
