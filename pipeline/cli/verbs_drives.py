@@ -333,6 +333,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     play: Path | None = None,
     cases: Annotated[bool, Parameter(negative=())] = False,
     json: bool = False,
+    quiet: bool = False,
 ) -> int:
     """Write a log with known physics.
 
@@ -349,6 +350,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
         cases: list the cases and effects instead.
         json: print one JSON object.
+        quiet: print nothing.
     """
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
@@ -377,7 +379,8 @@ def simulate(  # noqa: D417 - arguments document themselves
         play=play,
         written=() if effects.keys() <= {one.id for one in list_effects()} else list_written_effects(),
     )
-    return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
+    content = {"path": str(path), "effects": effects}
+    return print_result(content, lambda: [str(path)], json=json, quiet=quiet)
 
 
 def list_written_effects() -> tuple[EffectSpec, ...]:

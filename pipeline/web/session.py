@@ -282,7 +282,9 @@ def _show_parameter(
     file: ModelFile, effect: Effect, parameter: Parameter, *, fitted: bool
 ) -> dict[str, object]:
     value = effect.values[parameter.name]
-    low, high = find_range(parameter, value)
+    # What is usual for a parameter of somebody's formula is not known: its value says how large it is.
+    is_measure = isinstance(effect, FormulaEffect) and value != parameter.neutral
+    low, high = find_range(parameter, value, value if is_measure else parameter.typical)
     interval = file.intervals.get(f"{effect.id}.{parameter.name}")
     # With the digits that the interval supports, as on the screen.
     said, *ends = split_interval(value, *interval) if interval else ("",)
@@ -304,11 +306,11 @@ def _show_parameter(
     }
 
 
-def find_range(parameter: Parameter, value: float) -> tuple[float, float]:
+def find_range(parameter: Parameter, value: float, typical: float) -> tuple[float, float]:
     """Ends of a slider within the bounds; they include the neutral, the usual and the present value."""
     is_finite = math.isfinite(parameter.neutral)
     neutral = parameter.neutral if is_finite else value
-    usual = abs(parameter.typical - neutral) if is_finite else max(abs(value), abs(parameter.typical))
+    usual = abs(typical - neutral) if is_finite else max(abs(value), abs(typical))
     usual = usual or 1.0
     low = min(neutral - usual, neutral - 2.0 * (neutral - value), value - 0.5 * usual)
     high = max(neutral + usual, neutral + 2.0 * (value - neutral), value + 0.5 * usual)

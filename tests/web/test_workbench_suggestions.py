@@ -12,15 +12,18 @@ from workbench_server import RUN, TRACK, Workbench
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation.additions import explain_refusal
+from pipeline.models import ModelFile
+from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model import Model
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import read_model
 from pipeline.simulate import simulate_case
+from pipeline.sources import list_presets
 from pipeline.store import Store
 from pipeline.web import Ask, Limits, ServerFolders
 from pipeline.web.actions import Editor
 from pipeline.web.jobs import Jobs
-from pipeline.web.session import Session
+from pipeline.web.session import Session, Step, show_effect
 from pipeline.web.workbench import Sessions
 
 ROOT = Path(__file__).parents[2]
@@ -146,6 +149,17 @@ def test_all_of_the_diagnosis_is_its_model_whatever_was_done_before(
         assert found == wanted
         assert {effect.id: dict(effect.values) for effect in begun[0]} == wanted
         assert not any(one["undetermined"] for card in cards for one in card["parameters"])
+
+
+@pytest.mark.parametrize("value", [0.0783, -4e-4])
+def test_the_slider_of_a_formula_has_steps_that_are_small_beside_its_value(value: float) -> None:
+    parameter = make_parameter("k_1", "s/m", (-100.0, 100.0))
+    term = FormulaEffect("suggested_term", {"v_y": "k_1 * v0 * v0"}, (parameter,), k_1=value)
+    file = ModelFile(Model(next(iter(list_presets())), (term,)))
+    card: Any = show_effect(file, "suggested_term", Step(said="", model=""))
+    (shown,) = card["parameters"]
+    assert shown["from"] < min(0.0, value) <= max(0.0, value) < shown["to"]
+    assert shown["step"] < 0.05 * abs(value)
 
 
 @pytest.mark.long
