@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
@@ -85,7 +86,20 @@ def set_up_log(path: Path, options: LogOptions, index: LogIndex | None = None) -
     )
     recorded = index.deployment
     require_messages(index)
-    chosen = report_unused(choose(index, configuration, options.overrides), index)
+    chosen = choose(index, configuration, options.overrides)
+    sides = _find_only_sides(index, chosen.sources)
+    if sides is not None:
+        left, right = sides.left, sides.right
+        wheels = msgspec.structs.replace(configuration.wheels, left_topic=left, right_topic=right)
+        configuration = msgspec.structs.replace(configuration, wheels=wheels)
+        text = (
+            f"{left} and {right}, of a type that is not known, are taken for the left and right wheels by "
+            "their names ([wheels] in run.toml names others)"
+        )
+        taken = choose(index, configuration, options.overrides)
+        finding = Finding("sides_by_name", "warning", text, where=sides.topic)
+        chosen = replace(taken, findings=(*taken.findings, finding))
+    chosen = report_unused(chosen, index)
     require_sources(chosen, index, options)
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
@@ -232,6 +246,7 @@ _LEFT = re.compile(
     r"(?i:left)|(?<![A-Za-z])(?i:port|fl|rl|bl|lf|lr|l)(?![A-Za-z])|(?<![A-Za-z])[lL](?=(?i:wheel|motor|enc))"
     r"|(?<=[a-z])(?:FL|RL|BL|LF|LR|L)(?![A-Za-z])"
 )
+_AHEAD = re.compile(r"front|(?<![a-z])(?:fl|lf)(?![a-z])")
 _OF_A_WHEEL = re.compile("wheel|motor|rpm|tick|enc|count|speed|vel|pwm|duty|throttle")
 _NOT_OF_TURNING = re.compile("curr|volt|temp|torque|effort|error|fault|power|status|radius|diameter|pressure")
 _COMMANDED = re.compile(COMMANDED.pattern + "|pwm|duty|throttle")
@@ -259,15 +274,11 @@ def list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
     findings = _list_pairs(index, sources, used)
     if sources.wheels is not None and sources.command is not None:
         return findings
-    unknown = {
-        topic: paths
-        for topic, paths in list_fields(index).items()
-        if topic not in used and find_type(index.types.get(topic, "")) == MessageType()
-    }
+    unknown = _list_unknown(index, used)
     missing = {role for role in ("command", "wheels") if getattr(sources, role) is None}
-    sides = list(_list_sides(unknown))
+    sides = list(_find_sides(unknown))
     for role in sorted(missing):
-        findings += islice((finding for of, finding in sides if of == role), _MOST)
+        findings += islice((_offer(one) for one in sides if one.role == role), _MOST)
     if "command" in missing:
         findings += islice(_list_commands(unknown, index), _MOST)
     return findings
@@ -302,22 +313,61 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
     return findings
 
 
-def _list_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[tuple[str, Finding]]:
-    """Pairs of numbers that are named as those of left and right wheels, of unknown types, by role."""
+@dataclass(frozen=True)
+class _Sides:
+    """Numbers named as those of left and right wheels: their topic, paths, and the likeliest role."""
+
+    topic: str
+    left: str
+    right: str
+    role: str
+
+
+def _list_unknown(index: LogIndex, used: Collection[str]) -> dict[str, Collection[str]]:
+    """Fields of the topics of unknown types."""
+    return {
+        topic: paths
+        for topic, paths in list_fields(index).items()
+        if topic not in used and find_type(index.types.get(topic, "")) == MessageType()
+    }
+
+
+def _find_sides(unknown: Mapping[str, Collection[str]]) -> Iterator[_Sides]:
     numbers = {f"{topic}.{path}": topic for topic, paths in unknown.items() for path in paths}
     for left, topic in numbers.items():
         right, lower = _LEFT.sub(_name_right, left), left.lower()
         if right == left or right not in numbers or _NOT_OF_TURNING.search(lower):
             continue
-        if not _OF_A_WHEEL.search(lower):
-            continue
-        role = "command" if _COMMANDED.search(lower) and not MEASURED.search(lower) else "wheels"
-        unit = next((text for word, text in _UNITS.items() if re.search(word, lower)), _ANY_UNIT)
-        text = (
-            f"not used: {left} and {right}, whose meaning is not known; if they are the left and right "
-            f"wheels, in run.toml: [{role}] left_topic = {_quote(left)}; right_topic = {_quote(right)}{unit}"
+        if _OF_A_WHEEL.search(lower):
+            is_command = _COMMANDED.search(lower) and not MEASURED.search(lower)
+            yield _Sides(topic, left, right, "command" if is_command else "wheels")
+
+
+def _find_only_sides(index: LogIndex, sources: Sources) -> _Sides | None:
+    """The one pair that may be the wheels of a log without any drive; both axles of one topic are a pair."""
+    if sources.command is not None or sources.wheels is not None or sources.pose is None:
+        return None
+    pairs = [one for one in _find_sides(_list_unknown(index, ())) if one.role == "wheels"]
+    axles = {one.topic for one in pairs}, {bool(_AHEAD.search(one.left.lower())) for one in pairs}
+    if len(pairs) == len(SIDES) and [len(some) for some in axles] == [1, 2]:
+        (one, other), (topic,) = pairs, axles[0]
+        left, right = (
+            f"{first}+{second.removeprefix(f'{topic}.')}"
+            for first, second in ((one.left, other.left), (one.right, other.right))
         )
-        yield role, Finding("numbers_not_used", "warning", text, where=topic)
+        return _Sides(topic, left, right, "wheels")
+    return pairs[0] if len(pairs) == 1 else None
+
+
+def _offer(sides: _Sides) -> Finding:
+    """The line that takes numbers for a role."""
+    unit = next((text for word, text in _UNITS.items() if re.search(word, sides.left.lower())), _ANY_UNIT)
+    text = (
+        f"not used: {sides.left} and {sides.right}, whose meaning is not known; if they are the left and "
+        f"right wheels, in run.toml: [{sides.role}] left_topic = {_quote(sides.left)}; "
+        f"right_topic = {_quote(sides.right)}{unit}"
+    )
+    return Finding("numbers_not_used", "warning", text, where=sides.topic)
 
 
 def _quote(name: str) -> str:

@@ -383,11 +383,16 @@ class Extraction:
         leaning = lean(times, position, quaternion, imu, turn)
         if leaning is None:
             return position, quaternion
-        position, quaternion, steepest = leaning
+        position, quaternion, steepest, angle = leaning
         text = (
             f"the poses of {source.topic} know no slope: roll, pitch and height are by the orientations of "
             f"{imu.columns.topic}, up to {np.degrees(steepest):.0f} degrees"
         )
+        if angle:
+            text += (
+                f"; by its accelerations it is mounted {abs(np.degrees(angle)):.0f} degrees to the "
+                f"{'left' if angle > 0.0 else 'right'} of ahead"
+            )
         self.findings.append(Finding("slope_by_imu", "info", text, where="pose", value=steepest))
         return position, quaternion
 

@@ -531,15 +531,15 @@ def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tupl
     return lever, [Finding("child_frame", "info", text, where=topic)]
 
 
-def find_turn(topics: Sequence[TopicColumns], frame: str) -> Floats:
-    """Orientation of base_link in the frame of a sensor, shape (4,); the same without a static transform.
+def find_turn(topics: Sequence[TopicColumns], frame: str) -> Floats | None:
+    """Orientation of base_link in the frame of a sensor, shape (4,); None without a static transform.
 
     Args:
         topics: all topics that were read.
         frame: of the sensor, in the headers of its topic.
     """
     _, offset = _find_base(topics, frame.lstrip("/"))
-    return np.array([0.0, 0.0, 0.0, 1.0]) if offset is None else offset.quaternion[0]
+    return None if offset is None else offset.quaternion[0]
 
 
 def _find_base(topics: Sequence[TopicColumns], child: str) -> tuple[str, TransformSeries | None]:

@@ -387,3 +387,19 @@ def test_the_radius_of_the_wheels_of_an_unknown_car_is_no_scale_of_its_commands(
     )
     assert setup.vehicle.wheel_radius_m == pytest.approx(radius, rel=0.05)
     assert "times as fast as commanded" not in told(setup)
+
+
+@pytest.mark.parametrize("axles", [("",), ("front_", "rear_")], ids=["sides", "axles"])
+def test_numbers_named_as_sides_are_the_wheels_where_nothing_else_drives(
+    axles: tuple[str, ...], tmp_path: Path
+) -> None:
+    """A log with them and poses was refused, with the line that would have taken them."""
+    robot = Robot()
+    speeds = dict(zip(("left", "right"), RADIUS * robot.wheels.T, strict=True))
+    fields = {f"{axle}{side}": speed for axle in axles for side, speed in speeds.items()}
+    definition = "".join(f"float64 {name}\n" for name in fields)
+    topic = record_cdr(robot.does, "/base/wheel_velocity", "own_msgs/msg/Wheels", fields, definition)
+    setup = set_up(tmp_path, topic, robot.pose())
+    assert setup.sources.wheels is not None
+    assert "taken for the left and right wheels" in told(setup)
+    assert setup.vehicle.track_width_m == pytest.approx(TRACK / GAIN, rel=0.03)

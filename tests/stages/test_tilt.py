@@ -1,10 +1,12 @@
 """Poses in the plane get the slope that an IMU tells, and nothing where it tells none."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from drawn_drives import (
+    STEP_S,
     DrawnDrive,
     DrawnTopic,
     draw_drive,
@@ -27,7 +29,7 @@ def record_poses(drive: DrawnDrive, pitch: float = 0.0) -> DrawnTopic:
     return record_cdr(drive, "/amcl/pose", "geometry_msgs/msg/PoseStamped", fields)
 
 
-def record_imu(drive: DrawnDrive, slope: float, *, turned: bool = False) -> DrawnTopic:
+def record_imu(drive: DrawnDrive, slope: float, *, turned: bool = False, down: bool = False) -> DrawnTopic:
     """Orientations on a plane that rises to the north, in an IMU that looks ahead, or to the left."""
     normal = np.array([0.0, -np.sin(slope), np.cos(slope)])
     # In the frame of the heading, which is of a magnetometer that is a radian off.
@@ -39,6 +41,12 @@ def record_imu(drive: DrawnDrive, slope: float, *, turned: bool = False) -> Draw
         body = rigid.multiply_quaternions(body, quarter)
     fields = stamp_ros(drive) | {"header.frame_id": "imu_link", "angular_velocity.z": drive.turn}
     fields |= {f"orientation.{name}": body[:, i] for i, name in enumerate("xyzw")}
+    moved = np.column_stack((np.gradient(drive.speed, STEP_S), drive.speed * drive.turn, 0.0 * drive.turn))
+    moved = moved[:, [1, 0, 2]] * [1.0, -1.0, 1.0] if turned else moved
+    gravity = rigid.rotate(
+        rigid.invert_quaternions(body), np.broadcast_to([0.0, 0.0, -9.81 if down else 9.81], moved.shape)
+    )
+    fields |= {f"linear_acceleration.{name}": (moved + gravity)[:, i] for i, name in enumerate("xyz")}
     return record_cdr(drive, "/imu/data", "sensor_msgs/msg/Imu", fields)
 
 
@@ -50,18 +58,33 @@ def record_mounting(drive: DrawnDrive) -> DrawnTopic:
     return record_cdr(drive, "/tf_static", "tf2_msgs/msg/TFMessage", fields)
 
 
-@pytest.mark.parametrize("turned", [False, True], ids=["ahead", "turned"])
-def test_slope_and_height_of_poses_in_the_plane_are_those_of_an_imu(*, turned: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("turned", "is_known"), [(False, False), (True, True), (True, False)], ids=["ahead", "told", "felt"]
+)
+def test_slope_and_height_of_poses_in_the_plane_are_those_of_an_imu(
+    tmp_path: Path, *, turned: bool, is_known: bool
+) -> None:
+    """Which way it looks a transform tells, or what it feels of the driving."""
     drive, slope = draw_drive(60.0), np.radians(12.0)
     topics = [record_twist(drive), record_poses(drive), record_imu(drive, slope, turned=turned)]
-    topics += [record_mounting(drive)] if turned else []
+    topics += [record_mounting(drive)] if is_known else []
     log = write_drawn(tmp_path / "log.mcap", *topics)
     poses = extract_drawn(log)
-    assert poses["z"].to_numpy() == pytest.approx(np.tan(slope) * (drive.y - drive.y[0]), abs=0.02)
+    assert poses["z"].to_numpy() == pytest.approx(np.tan(slope) * (drive.y - drive.y[0]), abs=0.1)
     quaternion = poses.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     up = rigid.rotate(quaternion, np.broadcast_to([0.0, 0.0, 1.0], (poses.height, 3)))
-    assert up == pytest.approx(np.broadcast_to([0.0, -np.sin(slope), np.cos(slope)], up.shape), abs=4e-3)
-    assert "up to 12 degrees" in read_findings(log)["slope_by_imu"]
+    assert up == pytest.approx(np.broadcast_to([0.0, -np.sin(slope), np.cos(slope)], up.shape), abs=0.02)
+    said = read_findings(log)["slope_by_imu"]
+    assert "up to 12 degrees" in said
+    assert ("90 degrees to the left of ahead" in said) == (turned and not is_known)
+
+
+def test_an_orientation_that_is_not_of_its_specific_force_tells_no_slope(tmp_path: Path) -> None:
+    """One of north, east, down has the other sign of pitch."""
+    drive = draw_drive(60.0)
+    topic = record_imu(replace(drive, yaw=-drive.yaw), np.radians(12.0), down=True)
+    poses = extract_drawn(write_drawn(tmp_path / "log.mcap", record_twist(drive), record_poses(drive), topic))
+    assert (poses["z"] == 0.0).all()
 
 
 @pytest.mark.parametrize(("slope", "pitch"), [(1.0, 0.0), (12.0, 0.1)], ids=["floor", "known"])
