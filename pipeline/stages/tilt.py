@@ -93,7 +93,7 @@ def _find_mounting(
     if float(np.median(rigid.rotate(attitude, force)[:, 2] / np.maximum(size, 1.0))) < _UPRIGHT:
         return None
     good = np.isfinite(position).all(axis=1) & np.isfinite(yaw) & (np.diff(times, prepend=-np.inf) > 0.0)
-    times, place = times[good], position[good, :2]
+    times, plane = times[good], position[good, :2]
     inside = (at > times[0] + _WINDOW_S) & (at < times[-1] - _WINDOW_S) & np.isfinite(force).all(axis=1)
     at, attitude, force = at[inside], attitude[inside], force[inside]
     if at.size < reading.FEWEST_MESSAGES:
@@ -101,7 +101,7 @@ def _find_mounting(
     roll, pitch, _ = rigid.euler_from_quaternions(attitude)
     level = rigid.rotate(rigid.quaternions_from_euler(roll, pitch, np.zeros(roll.size)), force)
     # Means over the window: the change of the velocity over it is that of the acceleration.
-    velocity = arrays.differentiate_locally(times, times, place, _WINDOW_S)
+    velocity = arrays.differentiate_locally(times, times, plane, _WINDOW_S)
     moved = arrays.differentiate_locally(at, times, velocity, _WINDOW_S)
     summed = np.column_stack([arrays.integrate_rate(at, part) for part in level[:, :2].T])
     felt = arrays.differentiate_locally(at, at, summed, 2.0 * _WINDOW_S)
