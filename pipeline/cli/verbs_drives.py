@@ -305,7 +305,7 @@ def format_plan(
         f"drive        {made.commands.duration_s:.0f} s on {ground}",
         f"place        start in the middle, heading along the length; end within {made.home_m:.1f} m of it",
         most,
-        f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
+        f"play         ros2 bag play {files[2]}    # {made.type_name} on {made.topic}",
         f"page         {files[-1]}",
         *(f"safety       {text}" for text in SAFETY),
         f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",

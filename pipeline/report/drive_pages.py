@@ -90,7 +90,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
 
 
 def _format_play(plan: Plan) -> str:
-    return f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})"
+    return f"ros2 bag play plan.mcap    # {plan.type_name} on {plan.topic}"
 
 
 def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
