@@ -7,7 +7,7 @@ force, which is gravity and the acceleration of the body, tells which way it is 
 
 import numpy as np
 
-from pipeline.core import Floats, arrays, rigid
+from pipeline.core import Complex, Flags, Floats, arrays, join_parts, rigid
 from pipeline.stages import reading
 
 _LEVEL_RAD = 1e-3
@@ -23,6 +23,10 @@ _WINDOW_S = 1.0
 """Span over which accelerations are compared [s]: shorter ones are noise of the poses."""
 _FOLLOWS = 0.3
 """Least share of a body's acceleration that its IMU's is explained by, where that tells its mounting."""
+_ONE_WAY = 0.5
+"""Length of the mean direction of the driving above which one direction prevails."""
+_PARTS, _SURE = 8, 3.0
+"""Parts of the way by which the error of a mounting is estimated, and how many errors it must be."""
 _TURNED_RAD = np.radians(30.0)
 """Least angle of a mounting [rad]: nobody mounts an IMU askew by less and says nothing, and noise may."""
 
@@ -53,12 +57,23 @@ def lean(
     if known.sum() < reading.FEWEST_MESSAGES:
         return None
     attitude, at, force = attitude[known], at[known], force[known]
-    angle = 0.0 if turn is not None else _find_mounting(times, position, yaw, (at, attitude, force))
-    if angle is None:
-        return None
+    body, inside = _measure_acceleration(times, position, yaw, at)
+    angle = 0.0
     if turn is None:
+        if not _is_of_force(attitude, force):
+            return None
+        roll, pitch, _ = rigid.euler_from_quaternions(attitude)
+        level = rigid.rotate(rigid.quaternions_from_euler(roll, pitch, np.zeros(roll.size)), force)
+        felt = _smooth(at[inside], (level[:, 0] + 1j * level[:, 1])[inside])
+        # A turned sensor feels what the body does, turned back.
+        turned = float(np.angle(np.vdot(felt, body)))
+        angle = turned if _share(felt, body) > _FOLLOWS and abs(turned) > _TURNED_RAD else 0.0
         turn = rigid.quaternions_from_yaw(np.array([-angle]))[0]
-    tilts = rigid.euler_from_quaternions(rigid.multiply_quaternions(attitude, turn[None]))[:2]
+    tilts = np.array(rigid.euler_from_quaternions(rigid.multiply_quaternions(attitude, turn[None]))[:2])
+    # A filter that takes accelerations for gravity leans where the body speeds up.
+    if _share(_smooth(at[inside], (1j * tilts[0] - tilts[1])[inside]), body) > _FOLLOWS:
+        return None
+    tilts -= _find_offsets(at, tilts, times, position, yaw)[:, None]
     low, high = np.quantile(tilts, (0.05, 0.95), axis=1)
     if float((high - low).max()) < 2.0 * _LEAST_RAD:
         return None
@@ -73,47 +88,87 @@ def lean(
     return position, leaning, float(np.abs([low, high]).max()), angle
 
 
-def _find_mounting(
-    times: Floats, position: Floats, yaw: Floats, imu: tuple[Floats, Floats, Floats]
-) -> float | None:
-    """Angle from ahead to the x axis of an IMU by accelerations [rad].
+def _is_of_force(attitude: Floats, force: Floats) -> bool:
+    """Whether orientations (n, 4) turn specific forces (n, 3) upward; of no force nothing is known."""
+    size = np.linalg.norm(np.nan_to_num(force), axis=1)
+    if float(np.median(size)) < 1.0:
+        return True
+    return float(np.median(rigid.rotate(attitude, force)[:, 2] / np.maximum(size, 1.0))) > _UPRIGHT
 
-    Zero where nothing tells; None where its orientation is not that of its specific force.
+
+def _measure_acceleration(times: Floats, position: Floats, yaw: Floats, at: Floats) -> tuple[Complex, Flags]:
+    """Mean acceleration of the body ahead + 1j * left over windows, and about which of some times.
 
     Args:
         times: of the poses [s], shape (n,).
         position: of the poses [m], shape (n, 3).
         yaw: of the poses [rad], shape (n,).
-        imu: times [s], orientations and specific forces [m/s^2] of the IMU, shape (m,), (m, 4) and (m, 3).
+        at: times in the middle of the windows [s], shape (m,).
     """
-    at, attitude, force = imu
-    size = np.linalg.norm(np.nan_to_num(force), axis=1)
-    if float(np.median(size)) < 1.0:
-        return 0.0
-    if float(np.median(rigid.rotate(attitude, force)[:, 2] / np.maximum(size, 1.0))) < _UPRIGHT:
-        return None
     good = np.isfinite(position).all(axis=1) & np.isfinite(yaw) & (np.diff(times, prepend=-np.inf) > 0.0)
     times, plane = times[good], position[good, :2]
-    inside = (at > times[0] + _WINDOW_S) & (at < times[-1] - _WINDOW_S) & np.isfinite(force).all(axis=1)
-    at, attitude, force = at[inside], attitude[inside], force[inside]
-    if at.size < reading.FEWEST_MESSAGES:
-        return 0.0
-    roll, pitch, _ = rigid.euler_from_quaternions(attitude)
-    level = rigid.rotate(rigid.quaternions_from_euler(roll, pitch, np.zeros(roll.size)), force)
-    # Means over the window: the change of the velocity over it is that of the acceleration.
+    inside: Flags = np.zeros(at.size, dtype=bool)
+    if times.size < reading.FEWEST_MESSAGES:
+        return np.zeros(0, dtype=np.complex128), inside
+    inside = (at > times[0] + _WINDOW_S) & (at < times[-1] - _WINDOW_S) & (np.diff(at, prepend=-np.inf) > 0.0)
+    at = at[inside]
+    # The change of the velocity over a window is the mean of the acceleration.
     velocity = arrays.differentiate_locally(times, times, plane, _WINDOW_S)
-    moved = arrays.differentiate_locally(at, times, velocity, _WINDOW_S)
-    summed = np.column_stack([arrays.integrate_rate(at, part) for part in level[:, :2].T])
-    felt = arrays.differentiate_locally(at, at, summed, 2.0 * _WINDOW_S)
-    body = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(-1j * np.interp(at, times, yaw[good]))
-    sensed = felt[:, 0] + 1j * felt[:, 1]
-    sensed = sensed - sensed.mean()
-    # A turned sensor feels what the body does, turned back.
-    shared = np.vdot(sensed, body)
-    power = float((np.vdot(body, body) * np.vdot(sensed, sensed)).real)
-    angle = float(np.angle(shared))
-    is_clear = float(abs(shared) ** 2) > _FOLLOWS * power and abs(angle) > _TURNED_RAD
-    return angle if is_clear else 0.0
+    moved = arrays.differentiate_locally(at, times, velocity, _WINDOW_S) if at.size else np.zeros((0, 2))
+    headings = np.exp(-1j * np.interp(at, times, yaw[good]))
+    return np.asarray(join_parts(*moved.T) * headings), inside
+
+
+def _smooth(at: Floats, values: Complex) -> Complex:
+    """Means over windows as those of the acceleration, less their own mean, shape (m,)."""
+    if at.size < reading.FEWEST_MESSAGES:
+        return np.zeros(at.size, dtype=np.complex128)
+    known = np.nan_to_num(values)
+    summed = np.column_stack([arrays.integrate_rate(at, part) for part in (known.real, known.imag)])
+    means = join_parts(*arrays.differentiate_locally(at, at, summed, 2.0 * _WINDOW_S).T)
+    return np.asarray(means - means.mean())
+
+
+def _share(one: Complex, other: Complex) -> float:
+    """Part of one series that another one explains, turned and scaled, from 0 to 1."""
+    power = float((np.vdot(one, one) * np.vdot(other, other)).real)
+    return float(abs(np.vdot(one, other)) ** 2) / power if power > 0.0 else 0.0
+
+
+def _find_offsets(at: Floats, tilts: Floats, times: Floats, position: Floats, yaw: Floats) -> Floats:
+    """Roll and pitch of the mounting [rad], shape (2,): what does not turn with the heading.
+
+    A slope that is driven one way and the other leans the body one way and the other. Zero where it is
+    driven one way.
+    """
+    steps = np.abs(np.diff(position[:, 0] + 1j * position[:, 1], append=np.nan))
+    far = float(np.nanquantile(steps, 0.99)) if np.isfinite(steps).any() else 0.0
+    # Every metre counts once, and a jump is none.
+    weight = np.sqrt(np.where(np.isfinite(steps) & np.isfinite(yaw), np.minimum(steps, far), 0.0))
+    ahead = np.exp(1j * np.nan_to_num(yaw))
+    total = float(weight @ weight)
+    if total <= 0.0 or abs(complex((weight**2) @ ahead)) > _ONE_WAY * total:
+        return np.zeros(2)
+    roll, pitch = (np.interp(times, at, tilt) for tilt in tilts)
+    one, none = np.ones(ahead.size), np.zeros(ahead.size)
+    # Of the offsets of roll and pitch, and of the mean gradient to the east and north.
+    columns = np.vstack((
+        np.column_stack((one, none, -ahead.imag, ahead.real)),
+        np.column_stack((none, one, -ahead.real, -ahead.imag)),
+    ))  # fmt: skip
+    wanted, both = np.concatenate((roll, pitch)), np.tile(weight, 2)
+    part = np.tile(np.cumsum(weight**2) * (_PARTS / total) // 1.0, 2)
+
+    def solve(rows: Flags) -> Floats:
+        weighed = both * rows
+        made = np.linalg.lstsq(columns * weighed[:, None], wanted * weighed, rcond=None)[0][:2]
+        return np.asarray(made, dtype=np.float64)
+
+    # The ground of one part of the way is not that of another (jackknife).
+    offsets = solve(np.ones(both.size, dtype=bool))
+    others = np.array([solve(part != number) for number in range(_PARTS)])
+    error = np.sqrt((_PARTS - 1.0) * np.mean((others - others.mean(axis=0)) ** 2, axis=0))
+    return np.where(np.abs(offsets) > _SURE * error, offsets, 0.0)
 
 
 def _span(values: Floats) -> float:

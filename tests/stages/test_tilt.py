@@ -18,7 +18,7 @@ from drawn_drives import (
     write_drawn,
 )
 
-from pipeline.core import rigid
+from pipeline.core import Floats, rigid
 
 
 def record_poses(drive: DrawnDrive, pitch: float = 0.0) -> DrawnTopic:
@@ -102,3 +102,33 @@ def test_a_floor_stays_level_and_slopes_that_are_known_stay(
     )
     assert (poses["z"] == 0.0).all()
     assert poses["q_y"].abs().max() < max(pitch, 1e-6)
+
+
+def record_tilt(drive: DrawnDrive, roll: Floats, pitch: Floats) -> DrawnTopic:
+    body = rigid.quaternions_from_euler(roll, pitch, drive.yaw)
+    fields = stamp_ros(drive) | {"header.frame_id": "imu_link", "angular_velocity.z": drive.turn}
+    fields |= {f"orientation.{name}": body[:, i] for i, name in enumerate("xyzw")}
+    return record_cdr(drive, "/imu/data", "sensor_msgs/msg/Imu", fields)
+
+
+def test_a_filter_that_takes_accelerations_for_gravity_tells_no_slope(tmp_path: Path) -> None:
+    """Heights of a floor that it made up were jumps of the localization."""
+    drive = draw_drive(60.0)
+    ahead, left = 3.0 * np.gradient(drive.speed, STEP_S), 3.0 * drive.speed * drive.turn
+    topic = record_tilt(drive, np.arctan(left / 9.81), -np.arctan(ahead / 9.81))
+    poses = extract_drawn(write_drawn(tmp_path / "log.mcap", record_twist(drive), record_poses(drive), topic))
+    assert (poses["z"] == 0.0).all()
+
+
+def test_what_does_not_turn_with_the_heading_is_no_slope_and_that_of_the_mounting(tmp_path: Path) -> None:
+    """On rounds over a slope of 10 degrees to the north an IMU leans by 6 degrees more."""
+    time = np.arange(0.0, 90.0, STEP_S)
+    speed, turn = 0.8 + 0.1 * np.sin(0.5 * time), np.full(time.size, 0.3)
+    yaw, slope, mounted = 0.3 * time, np.radians(10.0), np.radians(6.0)
+    x, y = (np.cumsum(speed * part) * STEP_S for part in (np.cos(yaw), np.sin(yaw)))
+    drive = DrawnDrive(time, speed, turn, x, y, yaw)
+    roll, pitch = slope * np.cos(yaw), -slope * np.sin(yaw)
+    topic = record_tilt(drive, roll, pitch + mounted)
+    poses = extract_drawn(write_drawn(tmp_path / "log.mcap", record_twist(drive), record_poses(drive), topic))
+    leaning = rigid.euler_from_quaternions(poses.select("q_x", "q_y", "q_z", "q_w").to_numpy())
+    assert np.degrees(leaning[1]) == pytest.approx(np.degrees(np.interp(poses["t"], time, pitch)), abs=0.5)
