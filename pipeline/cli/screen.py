@@ -410,7 +410,7 @@ def _format_knowledge(knowledge: Seen) -> list[tuple[str, str]]:
         for one in cast("Sequence[Sequence[str]]", knowledge.get("undecided") or [])
     ]
     if knowledge.get("enough"):
-        return [*rows, ("enough", "all effects are known to 5 %: no more driving is needed")]
+        return [*rows, ("enough", "all effects are known within 5 %: no more driving is needed")]
     if knowledge.get("data"):
         rows.append(("data", str(knowledge["data"])))
     rows += [("drive", one) for one in cast("Sequence[str]", knowledge.get("drive") or [])]
