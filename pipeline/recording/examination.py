@@ -24,7 +24,13 @@ from pipeline.recording.roles import (
     report_turn,
     settle_stamps,
 )
-from pipeline.recording.signs import report_axes, report_mounting, report_signs, turn_motion
+from pipeline.recording.signs import (
+    report_axes,
+    report_mounting,
+    report_signs,
+    report_speed_alone,
+    turn_motion,
+)
 from pipeline.recording.timeouts import settle_delay, settle_timeout
 from pipeline.recording.units import correct_wheel_unit, find_units, settle_gyro, settle_lengths
 from pipeline.run import GROUND_UNOBSERVABLE, Alignment
@@ -119,6 +125,7 @@ def examine(given: Given) -> Recording:
     motion = turn_motion(case, motion, readings)
     command, wheels = choose_roles(case, drives)
     report_axes(case, command)
+    report_speed_alone(case, (command, wheels))
     settle_stamps(case, command)
     settle_timeout(case, command, wheels, motion)
     report_turn(case, command)

@@ -136,6 +136,23 @@ def report_axes(case: Case, command: Candidate | None) -> None:
     case.findings.append(Finding("command_of_map", "error", text, where="command", value=margin))
 
 
+def report_speed_alone(case: Case, drives: Sequence[Candidate | None]) -> None:
+    """Tell speeds that come without a yaw rate, as of wheels on a bus: they say nothing of the heading."""
+    for drive in drives:
+        made = None if drive is None else drive.reading.explained
+        if drive is None or made is None or drive.reading.form != "body" or drive.reading.second is None:
+            continue
+        # A vehicle that is driven straight on, and drifts, does not turn round.
+        if drive.reading.second.moves or np.ptp(np.cumsum(made.motion.yaw)) < np.pi:
+            continue
+        text = (
+            f"{drive.source} says a speed, and a yaw rate of zero throughout, though the vehicle turns: its "
+            "errors of heading, and what they make of positions, say nothing (yaw_rate_topic and speed_topic "
+            "in run.toml name two topics, as of a gyro)"
+        )
+        case.findings.append(Finding("no_yaw_rate", "warning", text, where=drive.source.signals[0].topic))
+
+
 def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
     source = case.sources.pose
     who, drivers = _name_witnesses(signs, "turned"), _name_witnesses(signs, "ahead")

@@ -403,3 +403,16 @@ def test_numbers_named_as_sides_are_the_wheels_where_nothing_else_drives(
     assert setup.sources.wheels is not None
     assert "taken for the left and right wheels" in told(setup)
     assert setup.vehicle.track_width_m == pytest.approx(TRACK / GAIN, rel=0.03)
+
+
+@pytest.mark.parametrize("turns", [True, False], ids=["turns", "straight"])
+def test_a_speed_without_a_yaw_rate_is_told_where_the_vehicle_turns(*, turns: bool, tmp_path: Path) -> None:
+    """Ten degrees of heading were at the noise floor of it."""
+    robot = Robot()
+    if not turns:
+        way = np.cumsum(robot.does.speed) * 0.1
+        robot.does = replace(robot.does, turn=0.0 * way, yaw=0.0 * way, x=way, y=0.0 * way)
+    linear = {"twist.linear.x": 1.05 * robot.does.speed}
+    speed = record_cdr(robot.does, "/vehicle/twist", TWIST, stamp_ros(robot.does) | linear)
+    setup = set_up(tmp_path, speed, robot.pose())
+    assert ("a yaw rate of zero throughout" in told(setup)) == turns

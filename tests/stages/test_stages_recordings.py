@@ -133,7 +133,7 @@ def test_snow_commands_are_off_by_the_ratio_of_two_radii(recorded_results: Path)
     assert found["value"] == pytest.approx(0.30 / 0.165, rel=1e-6)
     # In turns the wheels differ by half of what it says: its track, too, is the Warthog's.
     assert "their difference is 0.56 times the commanded one" in found["text"]
-    assert "a wheel radius of 0.3 m and a track of 1.08 m, as of Clearpath Warthog" in found["text"]
+    assert "another vehicle (Clearpath Warthog: wheel radius 0.3 m, track 1.08 m)" in found["text"]
 
 
 @pytest.mark.parametrize("name", ["husky_wheels_wetgrass", "warthog_wheels_asphalt_2024_9_20_8h13s12"])
