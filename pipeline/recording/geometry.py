@@ -177,6 +177,9 @@ def describe_vehicle(
             "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
             "whose slip does not depend on wheel radius and track width"
         )
+        track = values.get("track_width_m")
+        if kind == "differential" and track is not None:
+            text += f"; a difference of the wheels is that at a track of {track:g} m (--track-width: another)"
         if kind == "omni":
             text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
         return "fitted_body", text

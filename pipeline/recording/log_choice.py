@@ -615,7 +615,8 @@ def _fit_vehicle(
     assumed = {key: value for key, value in _STAND_INS.items() if key not in values}
     if kind == "ackermann":
         assumed.pop("track_width_m", None)
-    name, text = describe_vehicle(recording.geometry, kind, values, [*known], is_body=is_body)
+    used: dict[str, object] = {**(assumed if is_body else {}), **values}
+    name, text = describe_vehicle(recording.geometry, kind, used, [*known], is_body=is_body)
     bare = {"name": "fitted vehicle", "track_width_m": None, "wheelbase_m": None}
     vehicle = msgspec.structs.replace(
         chosen.vehicle,

@@ -416,3 +416,12 @@ def test_a_speed_without_a_yaw_rate_is_told_where_the_vehicle_turns(*, turns: bo
     speed = record_cdr(robot.does, "/vehicle/twist", TWIST, stamp_ros(robot.does) | linear)
     setup = set_up(tmp_path, speed, robot.pose())
     assert ("a yaw rate of zero throughout" in told(setup)) == turns
+
+
+def test_a_difference_of_wheels_of_an_unknown_track_says_at_which_it_is(tmp_path: Path) -> None:
+    """One of 1 % was told as 2.2 %, which it would be at half a metre."""
+    robot = Robot()
+    turning = {"twist.linear.x": robot.does.speed, "twist.angular.z": robot.does.turn / GAIN}
+    odometry = record_cdr(robot.does, "/wheel_odom/twist", TWIST, stamp_ros(robot.does) | turning)
+    setup = set_up(tmp_path, robot.command(), odometry, robot.pose())
+    assert "a difference of the wheels is that at a track of 0.5 m" in told(setup)
