@@ -104,8 +104,13 @@ class Judged:
 
 def find_cost(fit: PartFit) -> float:
     """Minus twice the log-likelihood of a fit, with the price of its numbers and of unusual effects."""
-    unusual = sum(not any(p.quantities for p in effect.parameters) for effect in fit.state.effects)
-    return fit.score + PRICE * fit.numbers + _UNUSUAL * unusual
+    return fit.score + _find_price(fit.state, fit.numbers)
+
+
+def _find_price(state: State, numbers: int) -> float:
+    """What a model must bring for its numbers and unusual effects."""
+    unusual = sum(not any(p.quantities for p in effect.parameters) for effect in state.effects)
+    return PRICE * numbers + _UNUSUAL * unusual
 
 
 @dataclass(frozen=True)
@@ -133,7 +138,6 @@ class SearchResult:
         new: ids of the effects that are named.
         judged: how each of its effects was judged against the model without it, by id.
         rivals: models that the data do not separate from it.
-        refused: extensions of it that were not accepted.
         screen: what candidates explain of its residuals.
     """
 
@@ -142,7 +146,6 @@ class SearchResult:
     new: tuple[str, ...]
     judged: dict[str, Judged]
     rivals: tuple[Rival, ...]
-    refused: tuple[Judged, ...]
     screen: Screen
 
 
@@ -171,22 +174,21 @@ class Search:
     def run(self, start: State) -> SearchResult:
         """Search from a model."""
         first, asked = self.fit(start), self.given
-        extended, refused = self._extend_all(first)
-        result, other = self._conclude(first, extended, refused)
-        while other is not None:
+        extended = self._extend_all(first)
+        result, other = self._conclude(first, extended)
+        # What is a part of the extended model was passed by on the way to it.
+        while other is not None and not set(other.ids) <= set(extended.ids):
             # Models are compared with all that improves them, what is not accepted in the end included.
             before, given = find_cost(extended), self.given
             self.given = asked | {one.id for one in self._list_small(other)}
-            extended, refused = self._extend_all(other)
+            extended = self._extend_all(other)
             if self.budget.is_spent() or not find_cost(extended) < before - EQUAL:
                 self.given = given
                 break
-            result, other = self._conclude(first, extended, refused)
+            result, other = self._conclude(first, extended)
         return result
 
-    def _conclude(
-        self, first: PartFit, extended: PartFit, refused: Sequence[Judged]
-    ) -> tuple[SearchResult, PartFit | None]:
+    def _conclude(self, first: PartFit, extended: PartFit) -> tuple[SearchResult, PartFit | None]:
         """The result with a model's accepted effects, and a better model with others in the place of one."""
         current, judged = self.refuse(extended)
         rivals, better = list[Rival](), list[Judged]()
@@ -199,15 +201,12 @@ class Search:
                     rivals.append(Rival(name, other, behind))
                 if self._is_better(other, current):
                     better.append(other)
-        result = SearchResult(
-            first, current, tuple(judged), judged, tuple(rivals), tuple(refused), self.screen(current)
-        )
+        result = SearchResult(first, current, tuple(judged), judged, tuple(rivals), self.screen(current))
         chosen = _choose(better)
         return result, None if chosen is None else self.prune(chosen.fit)
 
-    def _extend_all(self, current: PartFit) -> tuple[PartFit, list[Judged]]:
-        """The model extended until nothing is accepted, and the extensions of it that were not."""
-        refused = list[Judged]()
+    def _extend_all(self, current: PartFit) -> PartFit:
+        """The model extended until nothing is accepted."""
         while not self.budget.is_spent():
             self.budget.report(self.part.title, current.ids)
             judged, refused = self._extend(current)
@@ -231,7 +230,7 @@ class Search:
                 break
             self.given |= {one.id for one in self._list_small(better, current.ids)}
             current = better
-        return current, refused
+        return current
 
     def _exchange(self, current: PartFit) -> PartFit | None:
         """A better model with others in the place of one effect, or with an effect for its special cases."""
@@ -242,13 +241,6 @@ class Search:
                 whole = self._try_beside(current, candidate)
             if whole is not None:
                 return whole
-        for name in current.ids:
-            if name in self.given or self.budget.is_spent():
-                continue
-            others = self.list_rivals(current, self._drop(current, [name]), [name])
-            best = _choose([one for one in others if self._is_better(one, current)])
-            if best is not None:
-                return self.prune(best.fit)
         return None
 
     def _is_better(self, other: Judged, current: PartFit) -> bool:
@@ -281,12 +273,22 @@ class Search:
         small = self._list_small(judged.fit, judged.base.ids)
         return not judged.refusal or (bool(small) and len(small) == len(judged.added))
 
-    def fit(self, state: State, noise: Noise | None = None) -> PartFit:
-        """The fit from a state; made once."""
+    def fit(self, state: State, noise: Noise | None = None, most: float = math.inf) -> PartFit:
+        """The fit from a state; made once, unless it ended early as it cannot cost less than `most`."""
         key = _make_key(state)
-        if key not in self._fits:
-            self._fits[key] = fit_part(self.part, state, noise=noise)
-        return self._fits[key]
+        if key in self._fits:
+            return self._fits[key]
+        fit = fit_part(self.part, state, noise=noise, reach=self._find_reach(state, most))
+        if find_cost(fit) < most:
+            self._fits[key] = fit
+        return fit
+
+    def _approach(self, base: PartFit, start: State, most: float) -> PartFit:
+        return approach(base, start, self._find_reach(start, most))
+
+    def _find_reach(self, state: State, most: float) -> float:
+        """The score of a model of this form that costs so much."""
+        return most - _find_price(state, len(self.part.list_free(state)))
 
     def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:
         return self.fit(fit.state.drop(names))
@@ -324,17 +326,18 @@ class Search:
             reached: cost of the model that they would replace.
         """
         judged, before, rough = dict[tuple[str, ...], Judged](), find_cost(base), list[PartFit]()
+        most, reached = min(before, reached + EQUAL), min(before, reached)
         for extensions, places in ((screen.list_singles(), singles), (screen.list_pairs(), pairs)):
             # Some steps show which may come near the best, and which keep nothing of what they promise.
             for extension in extensions[: _TRIED * places]:
                 if not places or not extension.net > wanted:
                     break
-                rough.append(approach(base, extension.add_to(base.state)))
+                rough.append(self._approach(base, extension.add_to(base.state), most))
                 places -= find_cost(rough[-1]) < before  # noqa: PLW2901
         for start in sorted(rough, key=find_cost):
-            if find_cost(start) > reached + _NEAR * max(before - reached, 0.0):
+            if find_cost(start) > reached + EQUAL + _NEAR * (before - reached):
                 break
-            fit = self._reduce(self.fit(start.state, start.noise), base)
+            fit = self._reduce(self.fit(start.state, start.noise, most), base)
             if set(fit.ids) == set(base.ids):
                 continue
             one = self._judge(base, fit, is_final=False)
