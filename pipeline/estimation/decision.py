@@ -190,7 +190,7 @@ class Search:
 
     def _conclude(self, first: PartFit, extended: PartFit) -> tuple[SearchResult, PartFit | None]:
         """The result with a model's accepted effects, and a better model with others in the place of one."""
-        current, judged = self.refuse(extended)
+        current, judged = self._restore(*self.refuse(extended), extended)
         rivals, better = list[Rival](), list[Judged]()
         for name, one in judged.items():
             for other in self.list_rivals(current, one.base, [name]):
@@ -400,6 +400,20 @@ class Search:
                 fit = self._drop(fit, least.added)
                 others = [one.added for one in refused if not set(one.added) & set(least.added)]
                 refused = [one for names in others if (one := self._judge_last(fit, names)).refusal]
+
+    def _restore(
+        self, fit: PartFit, judged: dict[str, Judged], extended: PartFit
+    ) -> tuple[PartFit, dict[str, Judged]]:
+        """The model with what was refused beside effects that went after it, and is accepted without them."""
+        gone = [effect for effect in extended.state.effects if effect.id not in fit.ids]
+        for _ in gone:
+            tried = (self.fit(fit.state.add(one)) for one in gone if one.id not in fit.ids)
+            others = [self._judge(fit, one, is_final=True) for one in tried]
+            best = min((one for one in others if not one.refusal), key=lambda one: one.cost, default=None)
+            if best is None or not best.cost < find_cost(fit) - EQUAL:
+                break
+            fit, judged = self.refuse(best.fit)
+        return fit, judged
 
     def _simplify(self, fit: PartFit) -> PartFit | None:
         """The model with a special case in the place of what is not accepted, or not surely, beyond it."""

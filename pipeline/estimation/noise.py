@@ -36,7 +36,7 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_SAME, _SAME_EXACT, _MOST_ROUNDS = 0.005, 1e-8, 30
+_SAME, _SAME_EXACT, _MOST_ROUNDS = 0.05, 1e-8, 30
 """Differences of chi-square at which the likelihood of both numbers, and the numbers, have converged, and
 rounds until then."""
 _FAR, _CLOSER = 2.0, 0.3
