@@ -478,14 +478,14 @@ class Search:
         cases = [name for name in cases if name not in self.given]
         if not effect.contains or not (cases or effect.starts) or candidate.id in current.ids:
             return None
-        base, largest = self._drop(current, cases), self.conditions.largest
-        starts = [base.state.add(candidate(**values)) for values in list_starts(candidate, largest)]
+        base, most = self._drop(current, cases), find_cost(current) - EQUAL
+        values = list_starts(candidate, self.conditions.largest)
         # Some steps show whether it may come near what its special cases explain.
-        rough = [approach(base, state) for state in starts]
-        own, explained = find_cost(current), find_cost(base) - find_cost(current)
-        fits = [self.fit(one.state, one.noise) for one in rough if find_cost(one) < own + _NEAR * explained]
+        rough = [self._approach(base, base.state.add(candidate(**one)), most) for one in values]
+        near = most + EQUAL + _NEAR * (find_cost(base) - find_cost(current))
+        fits = [self.fit(one.state, one.noise, most) for one in rough if find_cost(one) < near]
         fit = min(fits, key=find_cost, default=base)
-        if find_cost(fit) > own - EQUAL:
+        if find_cost(fit) > most:
             return None
         judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self.prune(fit)
@@ -498,14 +498,15 @@ class Search:
         """
         if candidate.id in current.ids or not candidate().acts_in(current.ids):
             return None
-        starts = list_starts(candidate, self.conditions.largest)
-        rough = (approach(current, current.state.add(candidate(**values))) for values in starts)
+        most = find_cost(current) - EQUAL
+        values = list_starts(candidate, self.conditions.largest)
+        rough = (self._approach(current, current.state.add(candidate(**one)), most) for one in values)
         best = min(rough, key=find_cost, default=None)
         if best is None:
             return None
-        fit = self._reduce(self.fit(best.state, best.noise), current)
+        fit = self._reduce(self.fit(best.state, best.noise, most), current)
         judged = self._judge(current, fit, is_final=False)
-        is_better = judged.added and not judged.refusal and judged.cost < find_cost(current) - EQUAL
+        is_better = judged.added and not judged.refusal and judged.cost < most
         return self.prune(fit) if is_better else None
 
 

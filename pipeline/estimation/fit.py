@@ -293,9 +293,9 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False, reach: f
     leaves them as they were before the last one. See `fit_part` for the reach.
     """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
-    near, most = 0.0 if exact else _NEWS, _FEW_STEPS if rough else _MOST_STEPS
+    most = _FEW_STEPS if rough else _MOST_STEPS
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
-    most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
+    unlearned = math.sqrt(4.0 * _ENOUGH * part.spans.size)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
     for count in range(1, most + 1 if fit.smooth else 1):
@@ -307,10 +307,12 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False, reach: f
             state = fit.state.move(moving, step)
             residual = part.find_residuals(state)
             fall = cost - measure_cost(part, fit.noise, state, free, residual)
+        # Numbers that must converge do so with the noise as it is, and then with it.
+        most_fallen = 0.0 if exact and is_fresh and not fall > 0.0 else unlearned
         if fall > 0.0:
             fit, cost, fallen = replace(fit, state=state, residual=residual), cost - fall, fallen + fall
             damping = max(damping / 30.0, 1e-9)
-            if fall <= near:
+            if fall <= _NEWS:
                 is_fresh, before = False, promised
                 continue
         elif is_fresh and promised >= enough and damping <= _STIFFEST:
@@ -318,7 +320,7 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False, reach: f
             # Where limits are met, the cost is rough: there, no place is better to the last digit.
             enough = _ENOUGH if promised < _NEWS else enough
             continue
-        elif (is_fresh or promised < enough) and fallen <= most_fallen:
+        elif (is_fresh or (promised < enough and not exact)) and fallen <= most_fallen:
             break
         if fallen > most_fallen:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
