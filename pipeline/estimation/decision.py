@@ -273,7 +273,7 @@ class Search:
         small = self._list_small(judged.fit, judged.base.ids)
         return not judged.refusal or (bool(small) and len(small) == len(judged.added))
 
-    def fit(self, state: State, noise: Noise | None = None, most: float = math.inf) -> PartFit:
+    def fit(self, state: State, most: float = math.inf, noise: Noise | None = None) -> PartFit:
         """The fit from a state; made once, unless it ended early as it cannot cost less than `most`."""
         key = _make_key(state)
         if key in self._fits:
@@ -283,8 +283,8 @@ class Search:
             self._fits[key] = fit
         return fit
 
-    def _approach(self, base: PartFit, start: State, most: float) -> PartFit:
-        return approach(base, start, self._find_reach(start, most))
+    def _approach(self, base: PartFit, start: State, noise: Noise, most: float) -> PartFit:
+        return approach(base, start, noise, self._find_reach(start, most))
 
     def _find_reach(self, state: State, most: float) -> float:
         """The score of a model of this form that costs so much."""
@@ -332,12 +332,13 @@ class Search:
             for extension in extensions[: _TRIED * places]:
                 if not places or not extension.net > wanted:
                     break
-                rough.append(self._approach(base, extension.add_to(base.state), most))
+                rough.append(self._approach(base, extension.add_to(base.state), screen.saturated.noise, most))
                 places -= find_cost(rough[-1]) < before  # noqa: PLW2901
-        for start in sorted(rough, key=find_cost):
-            if find_cost(start) > reached + EQUAL + _NEAR * (before - reached):
+        hopes = [(find_cost(one) - one.score + one.promised, one) for one in rough]
+        for hope, start in sorted(hopes, key=lambda pair: pair[0]):
+            if hope > reached + EQUAL + _NEAR * (before - reached):
                 break
-            fit = self._reduce(self.fit(start.state, start.noise, most), base)
+            fit = self._reduce(self.fit(start.state, most, start.noise), base)
             if set(fit.ids) == set(base.ids):
                 continue
             one = self._judge(base, fit, is_final=False)
@@ -481,9 +482,11 @@ class Search:
         base, most = self._drop(current, cases), find_cost(current) - EQUAL
         values = list_starts(candidate, self.conditions.largest)
         # Some steps show whether it may come near what its special cases explain.
-        rough = [self._approach(base, base.state.add(candidate(**one)), most) for one in values]
+        rough = [
+            self._approach(base, base.state.add(candidate(**one)), current.noise, most) for one in values
+        ]
         near = most + EQUAL + _NEAR * (find_cost(base) - find_cost(current))
-        fits = [self.fit(one.state, one.noise, most) for one in rough if find_cost(one) < near]
+        fits = [self.fit(one.state, most, one.noise) for one in rough if find_cost(one) < near]
         fit = min(fits, key=find_cost, default=base)
         if find_cost(fit) > most:
             return None
@@ -500,11 +503,14 @@ class Search:
             return None
         most = find_cost(current) - EQUAL
         values = list_starts(candidate, self.conditions.largest)
-        rough = (self._approach(current, current.state.add(candidate(**one)), most) for one in values)
+        rough = (
+            self._approach(current, current.state.add(candidate(**one)), current.noise, most)
+            for one in values
+        )
         best = min(rough, key=find_cost, default=None)
         if best is None:
             return None
-        fit = self._reduce(self.fit(best.state, best.noise, most), current)
+        fit = self._reduce(self.fit(best.state, most, best.noise), current)
         judged = self._judge(current, fit, is_final=False)
         is_better = judged.added and not judged.refusal and judged.cost < most
         return self.prune(fit) if is_better else None

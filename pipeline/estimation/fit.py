@@ -40,7 +40,7 @@ _NO_INFLUENCE = 1e-6
 """Change of the innovations, in standard deviations over the whole run, by a parameter's step: a number with
 less, such as that of a limit that is never reached, stays where it is."""
 _MOST_STEPS, _FEW_STEPS = 30, 3
-"""Steps of a fit, and of one that shows whether a model may come near the best one."""
+"""Steps of a fit, and fewest of one that shows whether a model may come near the best one."""
 _SHARES = (1.0, 0.5, 0.25, 0.1)
 """Shares of an extension's start at one of which its fit begins: where the cost is least."""
 _GRID = ((1.0, 8), (0.3, 3), (0.1, 2))
@@ -131,6 +131,11 @@ class PartFit:
         """Mean square of its weighted innovations, at least one."""
         count = max(self.white.residual.size - self.numbers, 1)
         return max(_sum_squares(self.white.residual) / count, 1.0)
+
+    @cached_property
+    def promised(self) -> float:
+        """Score that its next step promises."""
+        return self.score - _solve(self, _LOOSEST)[2]
 
     @cached_property
     def covariance(self) -> Floats:
@@ -258,12 +263,13 @@ def _walk_grids(fit: PartFit, *, exact: bool = False) -> PartFit:
     return fit
 
 
-def approach(base: PartFit, start: State, reach: float = math.inf) -> PartFit:
+def approach(base: PartFit, start: State, noise: Noise, reach: float = math.inf) -> PartFit:
     """Some steps of a fit from a model's extension, which show how near it may come to the best one.
 
     Args:
         base: the fitted model.
         start: the extension, at a start of its new numbers.
+        noise: what a good model leaves.
         reach: see `fit_part`.
     """
     part, new = base.part, set(start.ids) - set(base.ids)
@@ -275,8 +281,11 @@ def approach(base: PartFit, start: State, reach: float = math.inf) -> PartFit:
         # What changes nothing at all has no derivative, either.
         acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
         start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
-    fit = _begin(part, start, base.noise)
-    return _walk_grids(_descend(fit, rough=True, reach=reach)) if fit.free else fit
+    free, residual = part.list_free(start), part.find_residuals(start)
+    fit = PartFit(part, start, free, residual, part.differentiate(start, residual, free), base.noise)
+    steps = max(_FEW_STEPS, len(free) - len(base.free))
+    fit = _walk_grids(_descend(fit, rough=steps, reach=reach)) if free else fit
+    return replace(fit, noise=part.learn(fit.residual, noise))
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
@@ -285,15 +294,21 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
     return float((part.weight * huber_cost(innovations)).sum()) + part.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False, reach: float = math.inf) -> PartFit:
+def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, reach: float = math.inf) -> PartFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
     Derivatives are computed anew after a step that was news, and where steps without become hardly smaller:
-    at the end they are those of the last place but for steps that were none. A rough one takes few steps and
-    leaves them as they were before the last one. See `fit_part` for the reach.
+    at the end they are those of the last place but for steps that were none.
+
+    Args:
+        fit: where to begin.
+        exact: see `fit_part`.
+        rough: most steps of a rough descent, by the noise as it is; its derivatives are those before the last
+            step. 0 for a whole one.
+        reach: see `fit_part`.
     """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
-    most = _FEW_STEPS if rough else _MOST_STEPS
+    most = rough or _MOST_STEPS
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     unlearned = math.sqrt(4.0 * _ENOUGH * part.spans.size)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
@@ -322,12 +337,10 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: bool = False, reach: f
             continue
         elif (is_fresh or (promised < enough and not exact)) and fallen <= most_fallen:
             break
-        if fallen > most_fallen:
+        if fallen > most_fallen and not rough:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
             cost, fallen = measure_cost(part, fit.noise, fit.state, free, fit.residual), 0.0
-        if rough and count == most:
-            break
-        if fall > 0.0 or not is_fresh:
+        if (fall > 0.0 or not is_fresh) and count != rough:
             fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
         is_fresh, before = True, math.inf
     return fit

@@ -57,9 +57,8 @@ def search_formula(
     first, *others = search.part.comparisons
     wheels = not others and first.context.vehicle.kind == "differential"
     terms = list_terms(sideways=sideways, wheels=wheels)
-    final, least, base = outcome.final, find_cost(outcome.final), outcome.final
+    final = outcome.final
     wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
-    added: list[FormulaEffect] = []
     offers: list[tuple[PartFit, PartFit, float]] = []
     if wide.screen(final).list_singles():
         beside = wide.run(final.state)
@@ -79,18 +78,23 @@ def search_formula(
             for one in rivals
             if not one.refusal and wide.replaces(final, one, 2.0 * PRICE)
         ]
-    for fit, without, margin in offers:
-        new = _list_terms(fit)
-        cost = find_cost(fit) + 2.0 * math.log(_SHAPES) * len(new)
-        if new and cost < least - margin:
-            least, base, added = cost, without, new
-    if not added:
+    better = [
+        (cost, fit, without)
+        for fit, without, margin in offers
+        if _list_terms(fit)
+        and (cost := find_cost(fit) + 2.0 * math.log(_SHAPES) * len(_list_terms(fit)))
+        < find_cost(final) - margin
+    ]
+    if not better:
         return outcome, None
+    least = min(cost for cost, *_ in better)
+    near = [(fit.numbers, cost, fit, without) for cost, fit, without in better if cost < least + EQUAL]
+    _, _, chosen, base = min(near, key=lambda one: one[:2])
     if base is final and any(
         one.gain > _SAME * (final.score - least) for one in outcome.screen.list_singles()
     ):
         return outcome, None
-    return replace(outcome, final=base), join_formula(added)
+    return replace(outcome, final=base), join_formula(_list_terms(chosen))
 
 
 def _list_terms(fit: PartFit) -> list[FormulaEffect]:
