@@ -278,17 +278,11 @@ class Search:
         key = _make_key(state)
         if key in self._fits:
             return self._fits[key]
-        fit = fit_part(self.part, state, noise=noise, reach=self._find_reach(state, most))
+        reach = most - _find_price(state, len(self.part.list_free(state)))
+        fit = fit_part(self.part, state, noise=noise, reach=reach)
         if find_cost(fit) < most:
             self._fits[key] = fit
         return fit
-
-    def _approach(self, base: PartFit, start: State, noise: Noise, most: float) -> PartFit:
-        return approach(base, start, noise, self._find_reach(start, most))
-
-    def _find_reach(self, state: State, most: float) -> float:
-        """The score of a model of this form that costs so much."""
-        return most - _find_price(state, len(self.part.list_free(state)))
 
     def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:
         return self.fit(fit.state.drop(names))
@@ -332,7 +326,7 @@ class Search:
             for extension in extensions[: _TRIED * places]:
                 if not places or not extension.net > wanted:
                     break
-                rough.append(self._approach(base, extension.add_to(base.state), screen.saturated.noise, most))
+                rough.append(approach(base, extension.add_to(base.state), screen.saturated.noise))
                 places -= find_cost(rough[-1]) < before  # noqa: PLW2901
         hopes = [(find_cost(one) - one.score + one.promised, one) for one in rough]
         for hope, start in sorted(hopes, key=lambda pair: pair[0]):
@@ -482,9 +476,7 @@ class Search:
         base, most = self._drop(current, cases), find_cost(current) - EQUAL
         values = list_starts(candidate, self.conditions.largest)
         # Some steps show whether it may come near what its special cases explain.
-        rough = [
-            self._approach(base, base.state.add(candidate(**one)), current.noise, most) for one in values
-        ]
+        rough = [approach(base, base.state.add(candidate(**one)), current.noise) for one in values]
         near = most + EQUAL + _NEAR * (find_cost(base) - find_cost(current))
         fits = [self.fit(one.state, most, one.noise) for one in rough if find_cost(one) < near]
         fit = min(fits, key=find_cost, default=base)
@@ -503,10 +495,7 @@ class Search:
             return None
         most = find_cost(current) - EQUAL
         values = list_starts(candidate, self.conditions.largest)
-        rough = (
-            self._approach(current, current.state.add(candidate(**one)), current.noise, most)
-            for one in values
-        )
+        rough = (approach(current, current.state.add(candidate(**one)), current.noise) for one in values)
         best = min(rough, key=find_cost, default=None)
         if best is None:
             return None

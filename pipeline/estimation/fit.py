@@ -263,14 +263,13 @@ def _walk_grids(fit: PartFit, *, exact: bool = False) -> PartFit:
     return fit
 
 
-def approach(base: PartFit, start: State, noise: Noise, reach: float = math.inf) -> PartFit:
+def approach(base: PartFit, start: State, noise: Noise) -> PartFit:
     """Some steps of a fit from a model's extension, which show how near it may come to the best one.
 
     Args:
         base: the fitted model.
         start: the extension, at a start of its new numbers.
         noise: what a good model leaves.
-        reach: see `fit_part`.
     """
     part, new = base.part, set(start.ids) - set(base.ids)
     weaker = [start.weaken(new, share) for share in _SHARES]
@@ -284,7 +283,7 @@ def approach(base: PartFit, start: State, noise: Noise, reach: float = math.inf)
     free, residual = part.list_free(start), part.find_residuals(start)
     fit = PartFit(part, start, free, residual, part.differentiate(start, residual, free), base.noise)
     steps = max(_FEW_STEPS, len(free) - len(base.free))
-    fit = _walk_grids(_descend(fit, rough=steps, reach=reach)) if free else fit
+    fit = _walk_grids(_descend(fit, rough=steps)) if free else fit
     return replace(fit, noise=part.learn(fit.residual, noise))
 
 
