@@ -241,6 +241,13 @@ class Search:
                 whole = self._try_beside(current, candidate)
             if whole is not None:
                 return whole
+        for name in current.ids:
+            if name in self.given or self.budget.is_spent():
+                continue
+            others = self.list_rivals(current, self._drop(current, [name]), [name])
+            best = _choose([one for one in others if self._is_better(one, current)])
+            if best is not None:
+                return self.prune(best.fit)
         return None
 
     def _is_better(self, other: Judged, current: PartFit) -> bool:
@@ -256,9 +263,12 @@ class Search:
 
     def _judge(self, base: PartFit, fit: PartFit, *, is_final: bool) -> Judged:
         small = self._list_small(fit, base.ids)
-        if set(fit.ids) - set(base.ids) - {one.id for one in small}:
-            # What is too small for a name has none, and keeps what comes with it from none.
-            base = self.fit(base.state.add(*small)) if small else base
+        named = set(fit.ids) - set(base.ids) - {one.id for one in small}
+        if small and named:
+            # What is too small for a name has none, and keeps what comes with it from none. It stays as it
+            # is beside that: fitted without, it would spread the trace of what shows but once.
+            held = [one.fix(*one.values) for one in small]
+            base = self.fit(fit.state.drop(named).add(*held))
         return judge(base, fit, self.conditions, self._least_t, is_final=is_final)
 
     def _list_small(self, fit: PartFit, known: Collection[str] = ()) -> list[Effect]:
