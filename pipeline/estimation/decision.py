@@ -288,8 +288,8 @@ class Search:
         key = _make_key(state)
         if key in self._fits:
             return self._fits[key]
-        reach = most - _find_price(state, len(self.part.list_free(state)))
-        fit = fit_part(self.part, state, noise=noise, reach=reach)
+        target = most - _find_price(state, len(self.part.list_free(state)))
+        fit = fit_part(self.part, state, noise=noise, target=target)
         if find_cost(fit) < most:
             self._fits[key] = fit
         return fit
@@ -338,9 +338,9 @@ class Search:
                     break
                 rough.append(approach(base, extension.add_to(base.state), screen.saturated.noise))
                 places -= find_cost(rough[-1]) < before  # noqa: PLW2901
-        hopes = [(find_cost(one) - one.score + one.promised, one) for one in rough]
-        for hope, start in sorted(hopes, key=lambda pair: pair[0]):
-            if hope > reached + EQUAL + _NEAR * (before - reached):
+        expected = [(find_cost(one) - one.score + one.promised, one) for one in rough]
+        for cost, start in sorted(expected, key=lambda pair: pair[0]):
+            if cost > reached + EQUAL + _NEAR * (before - reached):
                 break
             fit = self._reduce(self.fit(start.state, most, start.noise), base)
             if set(fit.ids) == set(base.ids):

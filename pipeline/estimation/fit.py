@@ -33,7 +33,7 @@ _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
 _CONVERGING = 0.3
 """Ratio of what two steps with the same derivatives promise, above which these are computed anew."""
-_HOPE = 8.0
+_MORE_THAN_PROMISED = 8.0
 """Falls of chi-square, in those that a step promises, that the rest of a fit may bring: of 900 fits to
 recordings, one in fifty brought more."""
 _NO_INFLUENCE = 1e-6
@@ -219,7 +219,7 @@ def fit_part(
     noise: Noise | None = None,
     per_run: Sequence[str] = (),
     exact: bool = False,
-    reach: float = math.inf,
+    target: float = math.inf,
 ) -> PartFit:
     """Fit all numbers of a state to one part of the path, with the noise of its residuals.
 
@@ -231,12 +231,12 @@ def fit_part(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
-        reach: score that it must come below: it ends early where its steps do not promise that.
+        target: score that it must come below: it ends early where its steps do not promise that.
     """
     fit = _begin(part, start, noise, per_run, exact=exact)
     if not fit.free:
         return fit
-    fit = _descend(fit, exact=exact, reach=reach)
+    fit = _descend(fit, exact=exact, target=target)
     for _ in range(_MOST_WALKS if len(fit.smooth) < len(fit.free) else 0):
         before = fit.score
         fit = _walk_grids(fit, exact=exact)
@@ -293,7 +293,7 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
     return float((part.weight * huber_cost(innovations)).sum()) + part.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, reach: float = math.inf) -> PartFit:
+def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float = math.inf) -> PartFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
     Derivatives are computed anew after a step that was news, and where steps without become hardly smaller:
@@ -304,7 +304,7 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, reach: float 
         exact: see `fit_part`.
         rough: most steps of a rough descent, by the noise as it is; its derivatives are those before the last
             step. 0 for a whole one.
-        reach: see `fit_part`.
+        target: see `fit_part`.
     """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
     most = rough or _MOST_STEPS
@@ -314,7 +314,7 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, reach: float 
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
     for count in range(1, most + 1 if fit.smooth else 1):
         moving, step, promised = _solve(fit, damping)
-        if is_fresh and damping <= _LOOSEST and fit.score - _HOPE * promised > reach:
+        if is_fresh and damping <= _LOOSEST and fit.score - _MORE_THAN_PROMISED * promised > target:
             break
         fall = 0.0
         if promised >= enough and (is_fresh or promised < _CONVERGING * before):
