@@ -517,7 +517,7 @@ class Search:
 
 def _make_key(state: State) -> tuple[object, ...]:
     """What two equal states have in common."""
-    return (*(effect.key for effect in state.effects), repr(state.own))
+    return (*((effect.key, effect.fixed) for effect in state.effects), repr(state.own))
 
 
 def _choose(judged: Sequence[Judged]) -> Judged | None:

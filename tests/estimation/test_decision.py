@@ -157,6 +157,16 @@ def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
     assert estimate_part(whole).find("brake_lag.tau_brake").value == pytest.approx(1.5, abs=0.1)
 
 
+def test_a_fit_that_ends_early_or_holds_a_number_is_not_taken_for_another_one() -> None:
+    context = prepare([drive({"effective_track": 1.3}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    made = Search(context.problem.parts[0], (), context.conditions)
+    start, track = context.problem.start_state(), find_effect("effective_track")(k=1.05)
+    early = made.fit(start.add(track), -1e9)
+    assert made.fit(start.add(track.fix("k"))).numbers < early.numbers
+    assert made.fit(start.add(track)).score < early.score - 100.0
+    assert made.fit(start.add(track), -1e9).score < early.score - 100.0
+
+
 def test_a_companion_without_a_start_in_its_bounds_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured wheels that exceed all starts of a limit leave it none."""
     context = prepare([drive({}, duration_s=60.0)], HUSKY, Input.COMMAND)
