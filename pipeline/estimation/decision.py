@@ -209,11 +209,10 @@ class Search:
         """The model extended until nothing is accepted."""
         while not self.budget.is_spent():
             self.budget.report(self.part.title, current.ids)
-            judged, refused = self._extend(current)
             known = current.ids
-            fine = [*judged, *(one for one in refused if self._is_fine(one))]
+            fine = [one for one in self._extend(current) if self._is_fine(one)]
             small = _choose([one for one in fine if self._list_small(one.fit, known)])
-            chosen = _choose([one for one in judged if not self._list_small(one.fit, known)])
+            chosen = _choose([one for one in fine if not self._list_small(one.fit, known)])
             if (
                 small is not None
                 and small.cost < find_cost(current if chosen is None else chosen.fit) - EQUAL
@@ -303,12 +302,11 @@ class Search:
         acting = [one for one in self.candidates if one.id not in known and one().acts_in(fit.ids)]
         return Screen(fit, acting, self.conditions.largest)
 
-    def _extend(self, current: PartFit) -> tuple[list[Judged], list[Judged]]:
-        """Accepted and refused extensions of a model."""
+    def _extend(self, current: PartFit) -> list[Judged]:
+        """Extensions of a model, accepted or refused."""
         if len(current.ids) - len(self.given) >= _MOST_EFFECTS:
-            return [], []
-        judged = self._judge_extensions(current, self.screen(current), _SINGLES, _PAIRS)
-        return [one for one in judged if not one.refusal], [one for one in judged if one.refusal]
+            return []
+        return self._judge_extensions(current, self.screen(current), _SINGLES, _PAIRS)
 
     def _judge_extensions(
         self,
@@ -338,7 +336,7 @@ class Search:
                     break
                 rough.append(approach(base, extension.add_to(base.state), screen.saturated.noise))
                 places -= find_cost(rough[-1]) < before  # noqa: PLW2901
-        expected = [(find_cost(one) - one.score + one.promised, one) for one in rough]
+        expected = [(find_cost(one) - one.promised, one) for one in rough]
         for cost, start in sorted(expected, key=lambda pair: pair[0]):
             if cost > reached + EQUAL + _NEAR * (before - reached):
                 break
@@ -484,9 +482,8 @@ class Search:
         if not effect.contains or not (cases or effect.starts) or candidate.id in current.ids:
             return None
         base, most = self._drop(current, cases), find_cost(current) - EQUAL
-        values = list_starts(candidate, self.conditions.largest)
         # Some steps show whether it may come near what its special cases explain.
-        rough = [approach(base, base.state.add(candidate(**one)), current.noise) for one in values]
+        rough = self._approach_all(base, candidate, current.noise)
         near = most + EQUAL + _NEAR * (find_cost(base) - find_cost(current))
         fits = [self.fit(one.state, most, one.noise) for one in rough if find_cost(one) < near]
         fit = min(fits, key=find_cost, default=base)
@@ -494,6 +491,11 @@ class Search:
             return None
         judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self.prune(fit)
+
+    def _approach_all(self, base: PartFit, candidate: Candidate, noise: Noise) -> list[PartFit]:
+        """Some steps of the model with a candidate, from each of its starts."""
+        values = list_starts(candidate, self.conditions.largest)
+        return [approach(base, base.state.add(candidate(**one)), noise) for one in values]
 
     def _try_beside(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with a companion of its effects, where it is better.
@@ -504,9 +506,7 @@ class Search:
         if candidate.id in current.ids or not candidate().acts_in(current.ids):
             return None
         most = find_cost(current) - EQUAL
-        values = list_starts(candidate, self.conditions.largest)
-        rough = (approach(current, current.state.add(candidate(**one)), current.noise) for one in values)
-        best = min(rough, key=find_cost, default=None)
+        best = min(self._approach_all(current, candidate, current.noise), key=find_cost, default=None)
         if best is None:
             return None
         fit = self._reduce(self.fit(best.state, most, best.noise), current)

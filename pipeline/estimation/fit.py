@@ -134,8 +134,8 @@ class PartFit:
 
     @cached_property
     def promised(self) -> float:
-        """Score that its next step promises."""
-        return self.score - _solve(self, _LOOSEST)[2]
+        """Fall of chi-square that its next step promises."""
+        return _solve(self, _LOOSEST)[2]
 
     @cached_property
     def covariance(self) -> Floats:
@@ -312,9 +312,10 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float
     unlearned = math.sqrt(4.0 * _ENOUGH * part.spans.size)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
+    most_cost = target - fit.noise.log_variance(part.steps, part.weight)
     for count in range(1, most + 1 if fit.smooth else 1):
         moving, step, promised = _solve(fit, damping)
-        if is_fresh and damping <= _LOOSEST and fit.score - _MORE_THAN_PROMISED * promised > target:
+        if is_fresh and damping <= _LOOSEST and cost - _MORE_THAN_PROMISED * promised > most_cost:
             break
         fall = 0.0
         if promised >= enough and (is_fresh or promised < _CONVERGING * before):
@@ -339,6 +340,7 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float
         if fallen > most_fallen and not rough:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
             cost, fallen = measure_cost(part, fit.noise, fit.state, free, fit.residual), 0.0
+            most_cost = target - fit.noise.log_variance(part.steps, part.weight)
         if (fall > 0.0 or not is_fresh) and count != rough:
             fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
         is_fresh, before = True, math.inf
