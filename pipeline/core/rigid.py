@@ -46,6 +46,11 @@ def invert_quaternions(quaternion: Floats) -> Floats:
     return conjugated
 
 
+def find_heights(quaternion: Floats) -> Floats:
+    """Heights of z axes, from -1 to 1, of unit quaternions of shape (..., 4)."""
+    return np.asarray(1.0 - 2.0 * (quaternion[..., 0] ** 2 + quaternion[..., 1] ** 2))
+
+
 def rotate(quaternion: Floats, vector: Floats) -> Floats:
     """Rotate vectors (n, 3) by unit quaternions (n, 4)."""
     axis, scalar = quaternion[..., :3], quaternion[..., 3:]

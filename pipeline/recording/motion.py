@@ -284,16 +284,15 @@ def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]
     The usual axis is z. Another one counts if the body turns most about it and moves along it least, and no
     ground would be so steep about z.
     """
-    before = quaternion[:-1] * np.array([-1.0, -1.0, -1.0, 1.0])
-    change = rigid.multiply_quaternions(quaternion[1:], before)
+    change = rigid.multiply_quaternions(quaternion[1:], rigid.invert_quaternions(quaternion[:-1]))
     rotation = 2.0 * change[:, :3] * np.sign(change[:, 3:])
     turning = (np.clip(rotation, -0.5, 0.5) ** 2).sum(axis=0)
     apart = min(8, position.shape[0] // 4)
     extent = np.quantile(np.abs(position[apart:] - position[:-apart]), 0.8, axis=0)
     axis = int(np.argmax(turning))
     # The cosine of the angle by which the body has leant since the first pose.
-    since = rigid.multiply_quaternions(quaternion, quaternion[:1] * np.array([-1.0, -1.0, -1.0, 1.0]))
-    tilted = float(np.quantile(1.0 - 2.0 * (since[:, 0] ** 2 + since[:, 1] ** 2), 0.05))
+    since = rigid.multiply_quaternions(quaternion, rigid.invert_quaternions(quaternion[:1]))
+    tilted = float(np.quantile(rigid.find_heights(since), 0.05))
     is_steep = tilted < _STEEPEST or extent[_Z] > math.hypot(extent[0], extent[1])
     if axis != _Z and not (is_steep and int(np.argmin(extent)) == axis):
         axis = _Z

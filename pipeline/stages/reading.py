@@ -396,7 +396,7 @@ def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Float
         quaternion = np.column_stack([quaternion[:, :3] @ turn.T, quaternion[:, 3]])
     leant, lean = 0.0, find_lean(quaternion)
     if lean is not None:
-        leant = float(np.arccos(np.clip(find_heights(lean), -1.0, 1.0)))
+        leant = float(np.arccos(np.clip(rigid.find_heights(lean), -1.0, 1.0)))
         quaternion = rigid.multiply_quaternions(quaternion, rigid.invert_quaternions(lean)[None])
     if section.heading_deg:
         half = 0.5 * np.radians(section.heading_deg)
@@ -411,11 +411,6 @@ _CONSTANT = 0.9
 """Share of a mean orientation above which it is that of a mounting: turns about another axis have none."""
 
 
-def find_heights(quaternion: Floats) -> Floats:
-    """Heights of z axes, from -1 to 1, of quaternions of shape (..., 4)."""
-    return np.asarray(1.0 - 2.0 * (quaternion[..., 0] ** 2 + quaternion[..., 1] ** 2))
-
-
 def find_lean(quaternion: Floats) -> Floats | None:
     """Orientation of a leaning frame on its vehicle, but for a heading, shape (4,); None where it is upright.
 
@@ -424,7 +419,7 @@ def find_lean(quaternion: Floats) -> Floats | None:
     size = np.linalg.norm(quaternion, axis=1)
     known = np.isfinite(size) & (size > 0.0)
     unit = quaternion[known] / size[known, None]
-    if not unit.size or float(np.median(find_heights(unit))) > _LEANS:
+    if not unit.size or float(np.median(rigid.find_heights(unit))) > _LEANS:
         return None
     headings = rigid.quaternions_from_yaw(rigid.euler_from_quaternions(unit)[2])
     mounted = rigid.multiply_quaternions(rigid.invert_quaternions(headings), unit)

@@ -149,9 +149,8 @@ def _describe_choice(run: RunDiagnosis) -> str:
 def _join_clauses(clauses: Sequence[str]) -> str:
     """Clauses in their order as one sentence, neighbours with the same subject joined."""
     groups = groupby(clauses, key=lambda one: one.startswith("the "))
-    parts = [(own, [*some]) for own, some in groups]
     sentences = [
-        one for own, some in parts for one in (some if own else [f"the robot {enumerate_texts(some)}"])
+        one for own, some in groups for one in (some if own else [f"the robot {enumerate_texts([*some])}"])
     ]
     return ", and ".join(filter(None, [", ".join(sentences[:-1]), *sentences[-1:]]))
 
