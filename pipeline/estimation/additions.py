@@ -14,7 +14,6 @@ import numpy as np
 
 from pipeline.core import format_share
 from pipeline.estimation.candidates import Screen
-from pipeline.estimation.context import Context
 from pipeline.estimation.decision import LEAST_T, measure_t
 from pipeline.estimation.errors import Errors
 from pipeline.estimation.held_out import number_predictions
@@ -94,7 +93,7 @@ def rank_named(
 
 def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
     """Effects whose expected gain exceeds the price of their parameters, per path the largest gain first."""
-    candidates = Context(problem).list_candidates(problem.source)
+    candidates = problem.list_candidates(problem.source)
     by_id = {candidate.id: candidate for candidate in candidates}
     promising = []
     for part, fit in zip(problem.parts, fitted.fits, strict=True):
@@ -186,7 +185,7 @@ def explain_refusals(
     idle = {one.id: explain_idle(one, after.effects) for one in added}
     if any(idle.values()):
         return {name: f"it {text}" for name, text in idle.items() if text}
-    conditions = Context(problem).conditions
+    conditions = problem.conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
         return alone
     t = min(measure_t(fit, one) for one in added for fit in after.fitted.fits if fit.part.owns(one))

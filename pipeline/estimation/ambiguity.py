@@ -23,9 +23,9 @@ from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 
 if TYPE_CHECKING:
-    from pipeline.estimation.context import Context
     from pipeline.estimation.ladder import Judgement
     from pipeline.estimation.model_fit import Fitted
+    from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import State
 
 DETECTED = LEAST_T + 1.3
@@ -100,11 +100,11 @@ class Clocks:
         ]
 
 
-def read_clocks(context: Context, state: State, source: Input) -> Clocks:
+def read_clocks(problem: Problem, state: State, source: Input) -> Clocks:
     """Identify clock effects: with a gyro the delays of heading and position are known separately."""
     extra = find_late(state.effects, Late.POSES)
     rows, positions, skews, certain = [], [], [], []
-    for number, (timing, run) in enumerate(zip(state.timing, context.runs, strict=True)):
+    for number, (timing, run) in enumerate(zip(state.timing, problem.runs, strict=True)):
         yaw = run.alignment.heading_delay_s
         own = find_late(state.effects_of(number), Late.POSES)
         heading_delay = own.delay if own is not None else 0.0
@@ -123,14 +123,14 @@ def read_clocks(context: Context, state: State, source: Input) -> Clocks:
     late_effects: list[Effect] = []
     late, heading_delay = float(np.mean(positions)), float(np.mean(skews))
     # Only a heading older than its position is reported as such; the opposite is a late position.
-    skewed = extra is not None and context.has_gyro and heading_delay < 0.0
+    skewed = extra is not None and problem.has_gyro and heading_delay < 0.0
     if skewed:
         late_effects.append(find_late_effect(Late.HEADING).of_delay(-heading_delay))
     least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
-    known = extra is not None if not context.has_gyro else any(certain)
+    known = extra is not None if not problem.has_gyro else any(certain)
     if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
-        if context.has_gyro and not context.largest.moves_both_ways:
+        if problem.has_gyro and not problem.largest.moves_both_ways:
             # The gyro gives the heading delay; relating it to the position clock needs driving and turning.
             skew = find_late_effect(Late.HEADING)()
             return Clocks(tuple(late_effects), tuple(rows), (Undecided((clock.id, skew.id)),))
@@ -158,9 +158,9 @@ def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
     return list(joined.values())
 
 
-def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
+def list_equivalents(effect: Effect, problem: Problem) -> tuple[str, ...]:
     """Effects equivalent to this one under the conditions of the recordings."""
-    return effect.equivalent_to if effect.is_equivalent(context.conditions) else ()
+    return effect.equivalent_to if effect.is_equivalent(problem.conditions) else ()
 
 
 def find_unobservable(

@@ -56,7 +56,6 @@ from pipeline.run import MotionError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation.context import Context
     from pipeline.estimation.decision import Judged, Search, SearchResult
     from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.problem import Problem
@@ -104,7 +103,7 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
 
 
 def summarize(
-    context: Context, source: Input, paths: Sequence[Explored], clocks: Clocks, length_scale_m: float
+    problem: Problem, source: Input, paths: Sequence[Explored], clocks: Clocks, length_scale_m: float
 ) -> tuple[Diagnosis, Sequence[Delays]]:
     """The common diagnosis of runs that were judged together.
 
@@ -112,16 +111,16 @@ def summarize(
         It as the only run of a diagnosis, and the delays of each run.
     """
     body = paths[0]
-    taken = _gather(paths, clocks, context)
+    taken = _gather(paths, clocks, problem)
     known = frozenset().union(*(path.search.given for path in paths))
     undecided = [*(item for path in paths for item in path.undecided), *clocks.undecided]
     inputs = tuple(dict.fromkeys((source, Input(body.path))))
-    judgements = _judge_ways(context, inputs, Model(context.vehicle, tuple(taken)))
+    judgements = _judge_ways(problem, inputs, Model(problem.vehicle, tuple(taken)))
     judgement = judgements.get(source.value)
     open_ids = {item.candidates[0] for item in undecided}
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
     widths = {} if judgement is None else narrow_intervals(judgement.fitted)
-    named = _order(tuple(_name(one, context, paths, judgement, widths) for one in added), judgement)
+    named = _order(tuple(_name(one, problem, paths, judgement, widths) for one in added), judgement)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
     # What the wheels leave is a matter of the ground, wherever the model starts.
@@ -137,8 +136,8 @@ def summarize(
             judgement = dataclasses.replace(judgement, suggested=suggestion.leading)
             judgements[source.value] = judgement
     learned = None if ground is None else learn_beyond(ground)
-    region = _find_region(context, judgement)
-    windows, start = context.problem.whole, body.outcome.start.state
+    region = _find_region(problem, judgement)
+    windows, start = problem.whole, body.outcome.start.state
     residual = windows.find_residuals(start)
     regions = map_errors(windows, residual, windows.find_places())
     hidden = {name for item in undecided for name in item.candidates}.union(
@@ -150,8 +149,8 @@ def summarize(
     ids = () if proposal is None else proposal.model.ids
     common = RunDiagnosis(
         input=source.value,
-        joint=tuple(run.name for run in context.runs),
-        vehicle=context.vehicle,
+        joint=tuple(run.name for run in problem.runs),
+        vehicle=problem.vehicle,
         effects=named,
         undecided=tuple(
             replace(item, in_model=next((name for name in item.candidates if name in ids), None))
@@ -183,7 +182,7 @@ def summarize(
         ),
         need=measure_need(named, widths),
     )
-    estimates = tuple(number for one in judgements.values() for number in list_estimates(context, one, named))
+    estimates = tuple(number for one in judgements.values() for number in list_estimates(problem, one, named))
     fitted = judgement.fitted if judgement else None
     return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
 
@@ -205,11 +204,11 @@ def _find_unexplained(
     return outcome
 
 
-def _find_region(context: Context, judgement: Judgement | None) -> Region | None:
+def _find_region(problem: Problem, judgement: Judgement | None) -> Region | None:
     """The region with most of the remaining error; None where it is spread evenly."""
     if judgement is None:
         return None
-    windows, residual = context.problem.whole, judgement.whole.held_out.residuals
+    windows, residual = problem.whole, judgement.whole.held_out.residuals
     known = np.where(np.isfinite(residual), residual, 0.0)
     return find_main_region(windows, known, windows.find_places())
 
@@ -220,7 +219,7 @@ def _begin(judgement: Judgement, undecided: Sequence[Undecided]) -> ModelFile:
 
 
 def of_run(
-    common: RunDiagnosis, recording: Recording, number: int, delays: Delays, context: Context
+    common: RunDiagnosis, recording: Recording, number: int, delays: Delays, problem: Problem
 ) -> RunDiagnosis:
     """The common diagnosis with the name, findings and delays of one run."""
     effects = tuple(
@@ -229,19 +228,19 @@ def of_run(
     for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
         (late,) = clock.parameters.values()
         delays = replace(delays, pose_delay_s=round(late.value, 4))
-    turn = measure_commanded_turn(context.runs[number], context.vehicle)
+    turn = measure_commanded_turn(problem.runs[number], problem.vehicle)
     return replace(
         common,
         run=recording.name,
         effects=effects,
-        findings=(*common.findings, *note_brevity(context, common), *recording.list_findings()),
+        findings=(*common.findings, *note_brevity(problem, common), *recording.list_findings()),
         timing=delays,
         when=tuple(one for one in common.when if one.run == number),
         commanded_turn=None if turn is None else turn.as_result(),
     )
 
 
-def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
+def _gather(paths: Sequence[Explored], clocks: Clocks, problem: Problem) -> list[Effect]:
     """All identified effects, with clock effects and composite effects under their own ids."""
     effects = {
         effect.id: effect
@@ -250,48 +249,48 @@ def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list
         if effect.late is not Late.POSES and effect.id in (*path.outcome.new, *path.outcome.start.ids)
     }
     effects |= {effect.id: effect for effect in clocks.effects}
-    joined = join_classes(list(effects.values()), context.vehicle)
+    joined = join_classes(list(effects.values()), problem.vehicle)
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 
-def _judge_ways(context: Context, inputs: Sequence[Input], model: Model) -> dict[str, Judgement]:
+def _judge_ways(problem: Problem, inputs: Sequence[Input], model: Model) -> dict[str, Judgement]:
     """The model of these effects judged from each input to the body."""
     # In sequence, so that the ground part of the model is fitted once for both.
-    judged = {source.value: _judge_path(context, model, source) for source in inputs}
+    judged = {source.value: _judge_path(problem, model, source) for source in inputs}
     return {name: one for name, one in judged.items() if one is not None}
 
 
-def _find_problem(context: Context, source: Input) -> Problem:
-    return context.problem if source is context.problem.source else context.problem.behind_wheels
+def _find_problem(problem: Problem, source: Input) -> Problem:
+    return problem if source is problem.source else problem.behind_wheels
 
 
-def _judge_path(context: Context, model: Model, source: Input) -> Judgement | None:
+def _judge_path(problem: Problem, model: Model, source: Input) -> Judgement | None:
     """The model judged from one input to the body; None where that is not possible."""
     with contextlib.suppress(MotionError):
-        return judge_model(_find_problem(context, source), model)
+        return judge_model(_find_problem(problem, source), model)
     return None
 
 
 def _name(
     effect: Effect,
-    context: Context,
+    problem: Problem,
     paths: Sequence[Explored],
     judgement: Judgement | None,
     widths: Mapping[str, Curve],
 ) -> Named:
     path = next((one for one in paths if one.judge(effect) is not None), paths[0])
     judged = path.judge(effect)
-    by_run = list_by_run(effect, context, judgement)
+    by_run = list_by_run(effect, problem, judgement)
     values = by_run[0]
     return Named(
         id=effect.id,
         parameters=values,
         gain=math.nan if judged is None else judged.gain / max(1.0 - judged.gain, 1e-12),
-        equivalent_to=list_equivalents(effect, context),
+        equivalent_to=list_equivalents(effect, problem),
         confused_with=tuple(
-            dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
+            dict.fromkeys((*effect.confused_with, *_list_trading(effect, problem, judgement)))
         ),
-        corrected=was_aligned(effect, context),
+        corrected=was_aligned(effect, problem),
         path=path.path,
         selection_frequency=math.nan if judged is None else judged.frequency,
         moves=None if judgement is None else measure_moves(judgement.fitted, effect),
@@ -310,7 +309,7 @@ def _grow_evidence(path: Explored, judged: Judged) -> Curve:
     return Curve(np.asarray(seconds, dtype=np.float64), np.sqrt(np.maximum(np.cumsum(judged.evidence), 0.0)))
 
 
-def _list_trading(effect: Effect, context: Context, judgement: Judgement | None) -> list[str]:
+def _list_trading(effect: Effect, problem: Problem, judgement: Judgement | None) -> list[str]:
     """Ids of effects whose estimate is correlated with a clock, or of clocks correlated with an effect."""
     if judgement is None:
         return []
@@ -318,7 +317,7 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
     clocks = {one.id for one in model if one.late in _CLOCKS}
     pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
     pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
-    if context.has_gyro:
+    if problem.has_gyro:
         # A clock that was corrected beforehand is not a parameter of the fit.
         aligned = find_late_effect(Late.POSES).id
         clocks.add(aligned)

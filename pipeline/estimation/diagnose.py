@@ -14,10 +14,10 @@ from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, find_undecided, find_unobservable, read_clocks
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.conclude import Explored
-from pipeline.estimation.context import Context, DiagnosisError, prepare
 from pipeline.estimation.decision import Search
 from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.encoder_scale import find_encoder_scale
+from pipeline.estimation.problem import DiagnosisError, Problem, prepare_problem
 from pipeline.estimation.recordings import Recording
 from pipeline.estimation.state import State
 from pipeline.estimation.together import Member, judge_together
@@ -86,42 +86,43 @@ def diagnose_runs(
 
     def search(members: Sequence[Member], runs: Sequence[MotionRun]) -> Diagnosis:
         chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
-        context = prepare(runs, vehicle, chosen.source)
+        problem = prepare_problem(runs, vehicle, chosen.source)
         driven = sum(run.duration_s for run in runs)
         budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
         # With more threads, the order of summation would depend on the number of cores.
         with threadpool_limits(limits=1, user_api="blas"):
-            paths, clocks = _explore(context, chosen.source, known, budget)
-            return _conclude([one.recording for one in members], context, chosen, paths, clocks)
+            paths, clocks = _explore(problem, chosen.source, known, budget)
+            return _conclude([one.recording for one in members], problem, chosen, paths, clocks)
 
     return judge_together(recordings, vehicle, leading, judge)
 
 
 def _explore(
-    context: Context, source: Input, known: Sequence[Effect], budget: Budget
+    problem: Problem, source: Input, known: Sequence[Effect], budget: Budget
 ) -> tuple[list[Explored], Clocks]:
     """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
-    problem, path = context.problem, source
-    if not context.is_drive_alone and source is Input.COMMAND and context.has_encoders:
-        problem, path = context.problem.behind_wheels, Input.MEASURED
+    body_problem, path = problem, source
+    if not problem.is_drive_alone and source is Input.COMMAND and problem.has_encoders:
+        body_problem, path = problem.behind_wheels, Input.MEASURED
     usable = [e for e in known if path is Input.COMMAND or e.place > Place.DRIVE]
-    candidates = context.list_candidates(path)
-    search = Search(problem.parts[0], candidates, context.conditions, frozenset(e.id for e in usable), budget)
-    body = _explore_part(context, search, path.value, problem.start_state(usable))
+    candidates = problem.list_candidates(path)
+    given = frozenset(e.id for e in usable)
+    search = Search(body_problem.parts[0], candidates, problem.conditions, given, budget)
+    body = _explore_part(problem, search, path.value, body_problem.start_state(usable))
     paths, state = [body], body.outcome.final.state
     if path is not source:
         driven = [e for e in known if e.place <= Place.DRIVE]
-        candidates, given = context.list_drivetrain(), frozenset(e.id for e in driven)
-        search = Search(context.problem.parts[1], candidates, context.conditions, given, budget)
-        paths.append(_explore_part(context, search, "wheels", State((), state.timing).add(*driven)))
-    return paths, read_clocks(context, state, path)
+        candidates, given = problem.list_drivetrain(), frozenset(e.id for e in driven)
+        search = Search(problem.parts[1], candidates, problem.conditions, given, budget)
+        paths.append(_explore_part(problem, search, "wheels", State((), state.timing).add(*driven)))
+    return paths, read_clocks(problem, state, path)
 
 
-def _explore_part(context: Context, search: Search, path: str, start: State) -> Explored:
+def _explore_part(problem: Problem, search: Search, path: str, start: State) -> Explored:
     outcome = search.run(start)
     formula = None
-    if path != "wheels" and not context.is_drive_alone:
-        sideways = context.vehicle.kinematics.has_inputs("sideways")
+    if path != "wheels" and not problem.is_drive_alone:
+        sideways = problem.vehicle.kinematics.has_inputs("sideways")
         outcome, formula = search_formula(search, outcome, sideways=sideways)
     unobservable, detectable = find_unobservable(search, outcome)
     undecided = tuple(find_undecided(search, outcome))
@@ -130,16 +131,16 @@ def _explore_part(context: Context, search: Search, path: str, start: State) -> 
 
 def _conclude(
     recordings: Sequence[Recording],
-    context: Context,
+    problem: Problem,
     chosen: InputChoice,
     paths: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
-    whole, delays = conclude.summarize(context, chosen.source, paths, clocks, recordings[0].length_scale_m)
+    whole, delays = conclude.summarize(problem, chosen.source, paths, clocks, recordings[0].length_scale_m)
     (common,) = whole.runs
     common = msgspec.structs.replace(common, input_reason=chosen.reason)
     runs = tuple(
-        conclude.of_run(common, recording, number, delays[number], context)
+        conclude.of_run(common, recording, number, delays[number], problem)
         for number, recording in enumerate(recordings)
     )
     return replace(whole, runs=runs)

@@ -42,7 +42,7 @@ from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.core import Budget
-    from pipeline.estimation.context import Context
+    from pipeline.estimation.problem import Problem
 
 _PASSES = 2
 """Steps of the estimate of an effect that a model lacks, the noise learned anew after each."""
@@ -109,21 +109,21 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
 
 
 def list_estimates(
-    context: Context, judgement: Judgement, named: Sequence[Named]
+    problem: Problem, judgement: Judgement, named: Sequence[Named]
 ) -> Iterator[EstimatedNumber]:
     """Estimates of one judged model, of the corrected clocks, and of the effects that the model lacks.
 
     Effects that contain one of the model, or are contained in one, are left out.
 
     Args:
-        context: the runs.
+        problem: the runs.
         judgement: a model on them.
         named: effects that the diagnosis names.
     """
     source, model = judgement.problem.source, judgement.fitted.model
     ids = {effect.id for effect in named}
     known = {effect.id for effect in list_effects()}
-    candidates = {e.id: e() for e in (*context.list_candidates(source), *context.list_drivetrain())}
+    candidates = {e.id: e() for e in (*problem.list_candidates(source), *problem.list_drivetrain())}
     rivals = [
         effect for effect in candidates.values() if effect.id not in ids and not _overlaps(effect, model)
     ]
@@ -153,13 +153,13 @@ def _overlaps(effect: Effect, model: Model) -> bool:
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
-def note_brevity(context: Context, common: RunDiagnosis) -> list[Finding]:
+def note_brevity(problem: Problem, common: RunDiagnosis) -> list[Finding]:
     """A finding where the driving is too short for reliable identification."""
     least, words = _LEAST_DRIVING_S[common.input]
-    driven = float(count_seconds(context.problem.whole).sum())
+    driven = float(count_seconds(problem.whole).sum())
     if driven >= least:
         return []
-    have = "the runs together have" if len(context.runs) > 1 else "the run has"
+    have = "the runs together have" if len(problem.runs) > 1 else "the run has"
     text = (
         f"{have} {math.floor(driven)} s of driving: effects estimated from {words} need at least "
         f"{least:.0f} s, with turns and speeds of both signs"
@@ -283,21 +283,21 @@ def _round(value: float) -> float | None:
     return finite_or_none(value, JSON_DIGITS)
 
 
-def was_aligned(effect: Effect, context: Context) -> bool:
+def was_aligned(effect: Effect, problem: Problem) -> bool:
     """Whether an effect is a clock offset that the gyro corrected before any model was fitted."""
-    return effect.late is Late.POSES and context.has_gyro
+    return effect.late is Late.POSES and problem.has_gyro
 
 
 def list_by_run(
-    effect: Effect, context: Context, judgement: Judgement | None
+    effect: Effect, problem: Problem, judgement: Judgement | None
 ) -> tuple[dict[str, Value], ...]:
     """Values of an effect: by run where runs or grounds have their own, else once."""
-    if was_aligned(effect, context):
-        delays = [run.alignment.heading_delay_s for run in context.runs]
+    if was_aligned(effect, problem):
+        delays = [run.alignment.heading_delay_s for run in problem.runs]
         beyond = effect.delay - float(np.mean(delays))
         return tuple(
             read_clock(effect.of_delay(beyond + delay), run)
-            for delay, run in zip(delays, context.runs, strict=True)
+            for delay, run in zip(delays, problem.runs, strict=True)
         )
     if judgement is None or effect.id not in judgement.fitted.model:
         return (list_values(effect, None),)
@@ -307,6 +307,6 @@ def list_by_run(
         # Where only some runs have a gyro, the delay that it corrected is part of the clock.
         by_run = [
             {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
-            for numbers, run in zip(by_run, context.runs, strict=False)
+            for numbers, run in zip(by_run, problem.runs, strict=False)
         ]
     return tuple(by_run)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, Newest, require_compiler
+from pipeline.core import Flags, Floats, Newest, SlipError, require_compiler
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.folds import Fold, find_near, make_folds
@@ -16,8 +17,18 @@ from pipeline.estimation.largest import measure_exceeded, measure_largest
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
 from pipeline.estimation.window_residuals import WindowResiduals
-from pipeline.models import Effect, Model, Timing
+from pipeline.models import (
+    Conditions,
+    Effect,
+    Excitation,
+    Model,
+    Place,
+    Timing,
+    is_of_one_run,
+    list_effects,
+)
 from pipeline.run import (
+    GROUND_UNOBSERVABLE,
     HeadingSource,
     MotionError,
     MotionRun,
@@ -25,10 +36,23 @@ from pipeline.run import (
 from pipeline.sources import Vehicle
 from pipeline.stages import SLOW_HZ
 
+if TYPE_CHECKING:
+    from pipeline.estimation.candidates import Candidate
+
 FEWEST_WINDOWS = 20
 """Minimum number of windows of a fit: a model of several effects has about as many parameters."""
 _MOST_FITS = 24
 """Number of cached fits of parts: more than the steps of a ladder of ten effects."""
+_FEWEST_DIAGNOSED = 40
+"""Half seconds of driving with poses that a diagnosis needs, over all of its runs: ten seconds, windows
+overlapping."""
+_LONG_S = 60.0
+"""Shortest run that can show a change with time [s]: in a shorter one its start is what changes."""
+_DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
+
+
+class DiagnosisError(SlipError):
+    """A diagnosis that cannot be made, in one line."""
 
 
 def _refuse_few(run: MotionRun, count: int) -> MotionError:
@@ -120,6 +144,64 @@ class Problem:
             Comparison(run, self.vehicle, source, heading=self.heading, rate_hz=rate) for run in self.runs
         )
 
+    @property
+    def has_encoders(self) -> bool:
+        """Whether every run has measured wheels."""
+        return all(run.wheels is not None for run in self.runs)
+
+    @property
+    def is_drive_alone(self) -> bool:
+        """Whether the poses are the motion of the wheels, so that only the drivetrain is observable."""
+        return any(run.is_drive_alone for run in self.runs)
+
+    @property
+    def has_gyro(self) -> bool:
+        """Whether every run has a good gyro as heading and clock."""
+        return all(comparison.has_gyro for comparison in self.comparisons)
+
+    @cached_property
+    def conditions(self) -> Conditions:
+        """What the runs can show; every search looks at measured wheels where there are any."""
+        encoders = self.has_encoders or self.is_drive_alone
+        sampling = self.sampling_s if encoders else 0.0
+        exceeded = self.exceeded
+        slope = max(comparison.context.slope_rad for comparison in self.comparisons)
+        course = any(run.is_on_course for run in self.runs)
+        return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope, course)
+
+    @property
+    def sampling_s(self) -> float:
+        """Delay that sampled encoders may feign: a little more than half their period."""
+        return 0.6 * max(run.wheel_period_s for run in self.runs)
+
+    def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
+        """Effects that can be identified from an input of this vehicle."""
+        if self.is_drive_alone:
+            return self.list_drivetrain()
+        hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds
+            and effect.place not in hidden
+            and not effect.parts
+            and self._can_show(effect())
+        )
+
+    def _can_show(self, effect: Effect) -> bool:
+        if len(self.runs) > 1 and is_of_one_run(effect.parameters):
+            return False
+        is_long = max(run.duration_s for run in self.runs) >= _LONG_S
+        return effect.can_show(self.conditions) and (is_long or Excitation.LONG not in effect.needs)
+
+    def list_drivetrain(self) -> tuple[Candidate, ...]:
+        """Effects between command and wheels."""
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN and self._can_show(effect())
+        )
+
     @cached_property
     def behind_wheels(self) -> Problem:
         """The same runs with their measured wheels as input; prepared data are shared."""
@@ -139,7 +221,7 @@ class Problem:
     def with_parts(self, parts: tuple[Part, ...]) -> Problem:
         """The same runs with other parts, without cached results of the former ones."""
         problem = copy(self)
-        for name in ("behind_wheels", "whole", "folds", "training"):
+        for name in ("behind_wheels", "whole", "folds", "training", "conditions"):
             problem.__dict__.pop(name, None)
         problem.parts = parts
         return problem
@@ -184,3 +266,43 @@ class Problem:
     def find_run_residuals(self, state: State, run: int) -> Floats:
         """Residuals of one run's windows."""
         return self.whole.find_run_residuals(state, run)
+
+
+def prepare_problem(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Problem:
+    """Make runs ready.
+
+    Raises:
+        DiagnosisError: ``no_input``; ``too_short``, fewer than a quarter of a minute of driving can be
+            compared.
+    """
+    where = ", ".join(run.name for run in runs)
+    try:
+        problem = Problem(runs, vehicle, source)
+    except MotionError as error:
+        if error.code != f"no_{source.value}":
+            raise
+        other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
+        what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
+        raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
+    _require_alike(runs)
+    windows = problem.whole.run.size
+    if windows < _FEWEST_DIAGNOSED:
+        what = f"only {windows} stretches of half a second have both a live input and valid poses"
+        hint = f"{_FEWEST_DIAGNOSED} are needed: drive longer, or check the poses with `slip inspect`."
+        raise DiagnosisError("too_short", what, where=where, hint=hint)
+    return problem
+
+
+def _require_alike(runs: Sequence[MotionRun]) -> None:
+    """Refuse to judge runs with poses and runs without together.
+
+    Raises:
+        DiagnosisError: ``ground_unobservable``.
+    """
+    alone = [run.name for run in runs if run.is_drive_alone]
+    if alone and len(alone) < len(runs):
+        what = (
+            "the log holds no pose, so that only its drivetrain is observable; others of these logs hold one"
+        )
+        hint = "Diagnose it without the others."
+        raise DiagnosisError(GROUND_UNOBSERVABLE, what, where=", ".join(alone), hint=hint)

@@ -28,7 +28,6 @@ from pipeline.estimation import (
 )
 from pipeline.estimation.additions import explain_refusal, explain_refusals
 from pipeline.estimation.apportion import apportion, find_half
-from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.floor import estimate_floor
@@ -507,7 +506,7 @@ class Editor:
             refusals = explain_refusals(
                 problem, before.ladder_step, whole.ladder_step, lambda: whole.intervals
             )
-        conditions = Context(problem).conditions
+        conditions = problem.conditions
         for name in (name for name in shown if name in step.order):
             why = explain_refusal(whole.fitted.model.effect(name), whole.intervals, conditions)
             if why := why or step.refused.get(name):

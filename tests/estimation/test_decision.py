@@ -13,10 +13,10 @@ from motion_runs import as_run, make_scenario, simulate, vehicle_of
 
 from pipeline.estimation import Input
 from pipeline.estimation.ambiguity import find_undecided
-from pipeline.estimation.context import prepare
 from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, measure_t
 from pipeline.estimation.fit import fit_part, make_folds
 from pipeline.estimation.intervals import estimate_part
+from pipeline.estimation.problem import prepare_problem
 from pipeline.estimation.state import State
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Timing, find_effect
@@ -46,10 +46,10 @@ def drive(effects: object, **more: object) -> MotionRun:
 
 def search(*runs: MotionRun, names: Collection[str] = ()) -> tuple[Search, SearchResult, State]:
     """The ground searched from the wheels, with candidates of these names or with all; and its start."""
-    context = prepare(runs, HUSKY, Input.MEASURED)
-    candidates = [one for one in context.list_candidates(Input.MEASURED) if not names or one.id in names]
-    made = Search(context.problem.parts[0], tuple(candidates), context.conditions)
-    start = context.problem.start_state()
+    problem = prepare_problem(runs, HUSKY, Input.MEASURED)
+    candidates = [one for one in problem.list_candidates(Input.MEASURED) if not names or one.id in names]
+    made = Search(problem.parts[0], tuple(candidates), problem.conditions)
+    start = problem.start_state()
     return made, made.run(start), start
 
 
@@ -107,9 +107,9 @@ def test_what_nobody_would_notice_has_no_name_however_evident_it_is() -> None:
 
 def test_a_lag_that_sampling_makes_has_no_name_and_keeps_a_limit_from_one() -> None:
     run = drive({"drive_lag": 0.02}, encoders=Encoders(rate_hz=20.0, noise_radps=0.003))
-    context = prepare([run], HUSKY, Input.COMMAND)
-    part, start = context.problem.parts[1], context.problem.start_state()
-    found = Search(part, context.list_drivetrain(), context.conditions).run(start)
+    problem = prepare_problem([run], HUSKY, Input.COMMAND)
+    part, start = problem.parts[1], problem.start_state()
+    found = Search(part, problem.list_drivetrain(), problem.conditions).run(start)
     assert found.new == ()
     assert found.final.ids == ("drive_lag",)
 
@@ -147,10 +147,10 @@ def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
     speed = np.where(times % 15.0 > 9.0, 0.4 + 0.1 * (times // 15.0), 0.0)
     played = Commands(times, speed, np.zeros(times.size))
     run = drive({"brake_lag": {"tau_drive": 0.3, "tau_brake": 1.5}}, duration_s=90.0, played=played)
-    context = prepare([run], HUSKY, Input.COMMAND)
-    lags = [one for one in context.list_candidates(Input.COMMAND) if one.id in {"drive_lag", "brake_lag"}]
-    made = Search(context.problem.parts[-1], tuple(lags), context.conditions)
-    one_lag = made.fit(context.problem.start_state().add(find_effect("drive_lag")(tau=0.9)))
+    problem = prepare_problem([run], HUSKY, Input.COMMAND)
+    lags = [one for one in problem.list_candidates(Input.COMMAND) if one.id in {"drive_lag", "brake_lag"}]
+    made = Search(problem.parts[-1], tuple(lags), problem.conditions)
+    one_lag = made.fit(problem.start_state().add(find_effect("drive_lag")(tau=0.9)))
     whole = made._try_whole(one_lag, next(one for one in lags if one.id == "brake_lag"))
     assert whole is not None
     assert whole.ids == ("brake_lag",)
@@ -158,9 +158,9 @@ def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
 
 
 def test_a_fit_that_ends_early_or_holds_a_number_is_not_taken_for_another_one() -> None:
-    context = prepare([drive({"effective_track": 1.3}, duration_s=60.0)], HUSKY, Input.COMMAND)
-    made = Search(context.problem.parts[0], (), context.conditions)
-    start, track = context.problem.start_state(), find_effect("effective_track")(k=1.05)
+    problem = prepare_problem([drive({"effective_track": 1.3}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    made = Search(problem.parts[0], (), problem.conditions)
+    start, track = problem.start_state(), find_effect("effective_track")(k=1.05)
     early = made.fit(start.add(track), -1e9)
     assert made.fit(start.add(track.fix("k"))).numbers < early.numbers
     assert made.fit(start.add(track)).score < early.score - 100.0
@@ -169,11 +169,11 @@ def test_a_fit_that_ends_early_or_holds_a_number_is_not_taken_for_another_one() 
 
 def test_a_companion_without_a_start_in_its_bounds_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured wheels that exceed all starts of a limit leave it none."""
-    context = prepare([drive({}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    problem = prepare_problem([drive({}, duration_s=60.0)], HUSKY, Input.COMMAND)
     limit = find_effect("turn_acceleration_limit")
-    made = Search(context.problem.parts[-1], (limit,), context.conditions)
+    made = Search(problem.parts[-1], (limit,), problem.conditions)
     monkeypatch.setattr("pipeline.estimation.decision.list_starts", lambda *_: [])
-    assert made._try_beside(made.fit(context.problem.start_state()), limit) is None
+    assert made._try_beside(made.fit(problem.start_state()), limit) is None
 
 
 def test_a_refusal_says_why() -> None:

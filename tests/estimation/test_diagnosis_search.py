@@ -10,10 +10,10 @@ import pytest
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Input, Problem, fit_model, load_recording
-from pipeline.estimation.context import prepare
 from pipeline.estimation.decision import Search
 from pipeline.estimation.fit import fit_part
 from pipeline.estimation.parts import BodyPart
+from pipeline.estimation.problem import prepare_problem
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.estimation.candidates import Candidate
-    from pipeline.estimation.context import Context
     from pipeline.estimation.state import State
     from pipeline.models import Effect
     from pipeline.run import MotionRun
@@ -59,16 +58,16 @@ def _load(scenario: Scenario, folder: Path) -> tuple[MotionRun, Vehicle]:
     return load_recording(recording, vehicle), vehicle
 
 
-def _prepare(scenario: Scenario, folder: Path) -> Context:
+def _prepare(scenario: Scenario, folder: Path) -> Problem:
     run, vehicle = _load(scenario, folder)
-    return prepare([run], vehicle, Input.COMMAND)
+    return prepare_problem([run], vehicle, Input.COMMAND)
 
 
-def _search(context: Context, effects: Sequence[Effect], candidates: Sequence[Candidate] = ()) -> State:
+def _search(problem: Problem, effects: Sequence[Effect], candidates: Sequence[Candidate] = ()) -> State:
     """What a search of the drivetrain names that begins at a model."""
-    candidates = candidates or context.list_drivetrain()
-    search = Search(context.problem.parts[1], tuple(candidates), context.conditions)
-    found = search.run(context.problem.start_state(effects))
+    candidates = candidates or problem.list_drivetrain()
+    search = Search(problem.parts[1], tuple(candidates), problem.conditions)
+    found = search.run(problem.start_state(effects))
     return found.final.state.hold([one for one in found.final.state.effects if one.id in found.new])
 
 
@@ -81,8 +80,8 @@ def _give(name: str, value: float) -> Effect:
 def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(tmp_path: Path) -> None:
     """Neither lag helps beside the delay alone, and beside both lags the limits are never reached."""
     names = ("body_speed_limit", "body_turn_limit", "transport_delay", "steering_gain")
-    context = _prepare(_CAR, tmp_path / "car")
-    found = _search(context, [find_effect(name)().make_usual(context.largest) for name in names])
+    problem = _prepare(_CAR, tmp_path / "car")
+    found = _search(problem, [find_effect(name)().make_usual(problem.largest) for name in names])
     assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
 
 
@@ -90,9 +89,9 @@ def test_a_delay_beside_limits_is_found_from_the_wrong_hollow_of_the_loss(tmp_pa
     """A descent from a delay that had stood for the limits, too, ends with .6 s and limits that never act."""
     true = {"transport_delay": 0.34, "body_acceleration_limit": 1.5, "turn_acceleration_limit": 1.5}
     scenario = replace(_CAR, vehicle=VEHICLES["husky"], effects=true, program=Program("drive_steps"))
-    context = _prepare(replace(scenario, duration_s=90.0), tmp_path / "husky")
+    problem = _prepare(replace(scenario, duration_s=90.0), tmp_path / "husky")
     wrong = {"transport_delay": 0.7, "body_acceleration_limit": 15.0, "turn_acceleration_limit": 15.0}
-    found = _search(context, [_give(*one) for one in wrong.items()])
+    found = _search(problem, [_give(*one) for one in wrong.items()])
     assert {e.id: next(iter(e.values.values())) for e in found.effects} == pytest.approx(true, rel=0.05)
 
 
@@ -104,10 +103,10 @@ def test_a_dead_time_and_a_limited_torque_take_the_place_of_a_lag_and_a_ramp(tmp
         "effective_track": 1.8,
     }
     scenario = Scenario(vehicle=VEHICLES["husky"], effects=effects, duration_s=60.0, seed=112)
-    context = _prepare(scenario, tmp_path / "husky")
-    whole = BodyPart(context.problem.comparisons)
-    search = Search(whole, context.list_candidates(Input.COMMAND), context.conditions)
-    assert set(search.run(context.problem.start_state()).new) == set(effects)
+    problem = _prepare(scenario, tmp_path / "husky")
+    whole = BodyPart(problem.comparisons)
+    search = Search(whole, problem.list_candidates(Input.COMMAND), problem.conditions)
+    assert set(search.run(problem.start_state()).new) == set(effects)
 
 
 def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -> None:
@@ -119,9 +118,9 @@ def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -
         program=Program("drive_steps", speed_scale=1.2, turn_scale=1.2),
         duration_s=90.0,
     )
-    context = _prepare(scenario, tmp_path / "husky")
+    problem = _prepare(scenario, tmp_path / "husky")
     wrong = {"drive_gain": 0.9, "body_speed_limit": 0.6}
-    (found,) = _search(context, [_give(*one) for one in wrong.items()]).effects
+    (found,) = _search(problem, [_give(*one) for one in wrong.items()]).effects
     assert found.id == "wheel_speed_scaling"
     assert found.values["limit"] == pytest.approx(4.0, rel=0.02)
 
@@ -167,17 +166,17 @@ def test_two_lags_of_a_car_are_found_together(tmp_path: Path) -> None:
 def test_effects_of_which_either_will_do_are_not_both_dropped(tmp_path: Path) -> None:
     """Where nothing but turning on the spot was driven, radius and track are one number."""
     scenario = replace(_HUSKY, effects={"wheel_radius": 0.85}, program=Program("spins"))
-    context = _prepare(scenario, tmp_path / "husky")
+    problem = _prepare(scenario, tmp_path / "husky")
     names = ("wheel_radius", "effective_track")
-    both = [find_effect(name)().make_usual(context.largest) for name in names]
-    search = Search(context.problem.parts[0], (), context.conditions)
-    assert len(search.run(context.problem.start_state(both)).new) == 1
+    both = [find_effect(name)().make_usual(problem.largest) for name in names]
+    search = Search(problem.parts[0], (), problem.conditions)
+    assert len(search.run(problem.start_state(both)).new) == 1
 
 
 def test_an_effect_that_acts_beside_another_one_alone_is_no_candidate_without_it(tmp_path: Path) -> None:
-    context = _prepare(replace(_HUSKY, effects={"drive_lag": 0.4}), tmp_path / "husky")
-    search = Search(context.problem.parts[1], context.list_drivetrain(), context.conditions)
-    fit = fit_part(search.part, context.problem.start_state([_give("drive_lag", 0.4)]))
+    problem = _prepare(replace(_HUSKY, effects={"drive_lag": 0.4}), tmp_path / "husky")
+    search = Search(problem.parts[1], problem.list_drivetrain(), problem.conditions)
+    fit = fit_part(search.part, problem.start_state([_give("drive_lag", 0.4)]))
     assert "motor_imbalance" in {one.id for one in search.candidates}
     assert "motor_imbalance" not in {trial.effect.id for trial in search.screen(fit).trials}
     assert find_effect("motor_imbalance")().acts_in(("wheel_servo",))
