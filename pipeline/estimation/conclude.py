@@ -70,7 +70,7 @@ class Explored:
     """Results of the search on one path.
 
     Attributes:
-        path: `command` to body, `measured` wheels to body, or command to `wheels`.
+        name: of the path in results: `command` to body, `measured` wheels to body, or command to `wheels`.
         search: how it was searched.
         found: what was found.
         formula: for what the effects leave; None without.
@@ -79,7 +79,7 @@ class Explored:
         detectable: detection limits of the other effects that were not identified.
     """
 
-    path: str
+    name: str
     search: Search
     outcome: SearchResult
     formula: FormulaEffect | None
@@ -103,34 +103,34 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
 
 
 def summarize(
-    problem: Problem, source: Input, paths: Sequence[Explored], clocks: Clocks, length_scale_m: float
+    problem: Problem, source: Input, results: Sequence[Explored], clocks: Clocks, length_scale_m: float
 ) -> tuple[Diagnosis, Sequence[Delays]]:
     """The common diagnosis of runs that were judged together.
 
     Returns:
         It as the only run of a diagnosis, and the delays of each run.
     """
-    body = paths[0]
-    taken = _gather(paths, clocks, problem)
-    known = frozenset().union(*(path.search.given for path in paths))
-    undecided = [*(item for path in paths for item in path.undecided), *clocks.undecided]
-    inputs = tuple(dict.fromkeys((source, Input(body.path))))
+    body = results[0]
+    taken = _gather(results, clocks, problem)
+    known = frozenset().union(*(result.search.given for result in results))
+    undecided = [*(item for result in results for item in result.undecided), *clocks.undecided]
+    inputs = tuple(dict.fromkeys((source, Input(body.name))))
     judgements = _judge_ways(problem, inputs, Model(problem.vehicle, tuple(taken)))
     judgement = judgements.get(source.value)
     open_ids = {item.candidates[0] for item in undecided}
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
     widths = {} if judgement is None else narrow_intervals(judgement.fitted)
-    named = _order(tuple(_name(one, problem, paths, judgement, widths) for one in added), judgement)
+    named = _order(tuple(_name(one, problem, results, judgement, widths) for one in added), judgement)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
     # What the wheels leave is a matter of the ground, wherever the model starts.
-    ground = judgements.get(body.path, judgement)
+    ground = judgements.get(body.name, judgement)
     suggestion = None
     if ground is not None and body.formula is not None:
         suggestion = residual_structure.suggest(ground, body.formula, judgement or ground)
     if ground is not None and suggestion is not None:
         # What a formula leaves is nearer to what nothing explains.
-        own = body.path if body.path in judgements else source.value
+        own = body.name if body.name in judgements else source.value
         ground = judgements[own] = dataclasses.replace(ground, suggested=suggestion.ground)
         if judgement is not None:
             judgement = dataclasses.replace(judgement, suggested=suggestion.leading)
@@ -143,7 +143,7 @@ def summarize(
     hidden = {name for item in undecided for name in item.candidates}.union(
         *({effect.id, *effect.searched_as, *effect.contains} for effect in taken)
     )
-    unobservable = {n: one for path in paths for n, one in path.unobservable.items() if n not in hidden}
+    unobservable = {n: one for result in results for n, one in result.unobservable.items() if n not in hidden}
     last = None if judgement is None else judgement.ladder.explained_shares(judgement.floor)[-1]
     proposal = None if judgement is None else note_fit(_begin(judgement, undecided), judgement)
     ids = () if proposal is None else proposal.model.ids
@@ -157,8 +157,8 @@ def summarize(
             for item in undecided
         ),
         unobservable_why=unobservable,
-        detectable=tuple(one for path in paths for one in path.detectable if one.id not in hidden),
-        unexplained=_find_unexplained(paths, learned, region)
+        detectable=tuple(one for result in results for one in result.detectable if one.id not in hidden),
+        unexplained=_find_unexplained(results, learned, region)
         if suggestion is None
         else suggestion.unexplained,
         findings=(
@@ -173,7 +173,7 @@ def summarize(
         else summarize_learned(learned, ground.ideal.errors, ground.floor),
         where=tuple(pick_regions(regions, residual, windows.noise)),
         when=() if judgement is None else find_moments(judgement),
-        by_path=_summarize_paths(paths, source, judgements.get("measured")),
+        by_path=_summarize_paths(results, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(body.outcome.final),
         concentrated=region,
         model=None if proposal is None else format_model(proposal),
@@ -188,18 +188,18 @@ def summarize(
 
 
 def _find_unexplained(
-    paths: Sequence[Explored], learned: LearnedStep | None, region: Region | None
+    results: Sequence[Explored], learned: LearnedStep | None, region: Region | None
 ) -> Unexplained | None:
     """What no effect and no formula explains: a learned term, what lasts, or where nearly all of it is."""
     if learned is not None:
-        described = residual_structure.describe_learned(learned, paths[0].path)
+        described = residual_structure.describe_learned(learned, results[0].name)
         if described is not None:
             return described
-    lasting = (residual_structure.find_lasting(path.outcome.final, path.path) for path in paths)
+    lasting = (residual_structure.find_lasting(result.outcome.final, result.name) for result in results)
     outcome = next(filter(None, lasting), None)
     if outcome is None and region is not None and is_narrow(region):
         return Unexplained(
-            "region", region.share, region.channel, (region.channel,), paths[0].path, region=region
+            "region", region.share, region.channel, (region.channel,), results[0].name, region=region
         )
     return outcome
 
@@ -240,13 +240,13 @@ def of_run(
     )
 
 
-def _gather(paths: Sequence[Explored], clocks: Clocks, problem: Problem) -> list[Effect]:
+def _gather(results: Sequence[Explored], clocks: Clocks, problem: Problem) -> list[Effect]:
     """All identified effects, with clock effects and composite effects under their own ids."""
     effects = {
         effect.id: effect
-        for path in paths
-        for effect in path.outcome.final.state.effects
-        if effect.late is not Late.POSES and effect.id in (*path.outcome.new, *path.outcome.start.ids)
+        for result in results
+        for effect in result.outcome.final.state.effects
+        if effect.late is not Late.POSES and effect.id in (*result.outcome.new, *result.outcome.start.ids)
     }
     effects |= {effect.id: effect for effect in clocks.effects}
     joined = join_classes(list(effects.values()), problem.vehicle)
@@ -274,12 +274,12 @@ def _judge_path(problem: Problem, model: Model, source: Input) -> Judgement | No
 def _name(
     effect: Effect,
     problem: Problem,
-    paths: Sequence[Explored],
+    results: Sequence[Explored],
     judgement: Judgement | None,
     widths: Mapping[str, Curve],
 ) -> Named:
-    path = next((one for one in paths if one.judge(effect) is not None), paths[0])
-    judged = path.judge(effect)
+    result = next((one for one in results if one.judge(effect) is not None), results[0])
+    judged = result.judge(effect)
     by_run = list_by_run(effect, problem, judgement)
     values = by_run[0]
     return Named(
@@ -291,20 +291,20 @@ def _name(
             dict.fromkeys((*effect.confused_with, *_list_trading(effect, problem, judgement)))
         ),
         corrected=was_aligned(effect, problem),
-        path=path.path,
+        path=result.name,
         selection_frequency=math.nan if judged is None else judged.frequency,
         moves=None if judgement is None else measure_moves(judgement.fitted, effect),
         growth=thin_growth(
-            None if judged is None else _grow_evidence(path, judged),
+            None if judged is None else _grow_evidence(result, judged),
             {name: widths[label] for name in values if (label := f"{effect.id}.{name}") in widths},
         ),
         by_run=by_run if len(by_run) > 1 else (),
     )
 
 
-def _grow_evidence(path: Explored, judged: Judged) -> Curve:
+def _grow_evidence(result: Explored, judged: Judged) -> Curve:
     """Evidence for an effect in standard errors by the seconds of driving."""
-    part = path.search.part
+    part = result.search.part
     seconds = np.cumsum(np.bincount(part.unit, part.spans, minlength=judged.evidence.size))
     return Curve(np.asarray(seconds, dtype=np.float64), np.sqrt(np.maximum(np.cumsum(judged.evidence), 0.0)))
 
@@ -337,13 +337,13 @@ def _list_steps(judgement: Judgement) -> tuple[Step, ...]:
 
 
 def _summarize_paths(
-    paths: Sequence[Explored], source: Input, measured: Judgement | None
+    results: Sequence[Explored], source: Input, measured: Judgement | None
 ) -> dict[str, PathLadder]:
     """Separate ladders of the ground and of the drivetrain."""
-    if len(paths) == 1:
+    if len(results) == 1:
         return {}
     described: dict[str, PathLadder] = {}
-    wheels = paths[1].outcome
+    wheels = results[1].outcome
     if source is Input.COMMAND and measured is not None:
         floor = read_result(errors_as_json(measured.floor), Errors)
         described["measured"] = PathLadder(measured.fitted.model.ids, _list_steps(measured), floor)

@@ -91,8 +91,8 @@ def diagnose_runs(
         budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
         # With more threads, the order of summation would depend on the number of cores.
         with threadpool_limits(limits=1, user_api="blas"):
-            paths, clocks = _explore(problem, chosen.source, known, budget)
-            return _conclude([one.recording for one in members], problem, chosen, paths, clocks)
+            results, clocks = _explore(problem, chosen.source, known, budget)
+            return _conclude([one.recording for one in members], problem, chosen, results, clocks)
 
     return judge_together(recordings, vehicle, leading, judge)
 
@@ -101,42 +101,42 @@ def _explore(
     problem: Problem, source: Input, known: Sequence[Effect], budget: Budget
 ) -> tuple[list[Explored], Clocks]:
     """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
-    body_problem, path = problem, source
+    body_problem, body_input = problem, source
     if not problem.is_drive_alone and source is Input.COMMAND and problem.has_encoders:
-        body_problem, path = problem.behind_wheels, Input.MEASURED
-    usable = [e for e in known if path is Input.COMMAND or e.place > Place.DRIVE]
-    candidates = problem.list_candidates(path)
+        body_problem, body_input = problem.behind_wheels, Input.MEASURED
+    usable = [e for e in known if body_input is Input.COMMAND or e.place > Place.DRIVE]
+    candidates = problem.list_candidates(body_input)
     given = frozenset(e.id for e in usable)
     search = Search(body_problem.parts[0], candidates, problem.conditions, given, budget)
-    body = _explore_part(problem, search, path.value, body_problem.start_state(usable))
-    paths, state = [body], body.outcome.final.state
-    if path is not source:
+    body = _explore_part(problem, search, body_input.value, body_problem.start_state(usable))
+    results, state = [body], body.outcome.final.state
+    if body_input is not source:
         driven = [e for e in known if e.place <= Place.DRIVE]
         candidates, given = problem.list_drivetrain(), frozenset(e.id for e in driven)
         search = Search(problem.parts[1], candidates, problem.conditions, given, budget)
-        paths.append(_explore_part(problem, search, "wheels", State((), state.timing).add(*driven)))
-    return paths, read_clocks(problem, state, path)
+        results.append(_explore_part(problem, search, "wheels", State((), state.timing).add(*driven)))
+    return results, read_clocks(problem, state, body_input)
 
 
-def _explore_part(problem: Problem, search: Search, path: str, start: State) -> Explored:
+def _explore_part(problem: Problem, search: Search, name: str, start: State) -> Explored:
     outcome = search.run(start)
     formula = None
-    if path != "wheels" and not problem.is_drive_alone:
+    if name != "wheels" and not problem.is_drive_alone:
         sideways = problem.vehicle.kinematics.has_inputs("sideways")
         outcome, formula = search_formula(search, outcome, sideways=sideways)
     unobservable, detectable = find_unobservable(search, outcome)
     undecided = tuple(find_undecided(search, outcome))
-    return Explored(path, search, outcome, formula, undecided, unobservable, tuple(detectable))
+    return Explored(name, search, outcome, formula, undecided, unobservable, tuple(detectable))
 
 
 def _conclude(
     recordings: Sequence[Recording],
     problem: Problem,
     chosen: InputChoice,
-    paths: Sequence[Explored],
+    results: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
-    whole, delays = conclude.summarize(problem, chosen.source, paths, clocks, recordings[0].length_scale_m)
+    whole, delays = conclude.summarize(problem, chosen.source, results, clocks, recordings[0].length_scale_m)
     (common,) = whole.runs
     common = msgspec.structs.replace(common, input_reason=chosen.reason)
     runs = tuple(
