@@ -26,7 +26,7 @@ from pipeline.store import Store
 def compare(one: Recording, other: Recording) -> list[float]:
     """Errors of position and heading with the numbers of the first run over those of a fit to the second."""
     carried = one.entries[NAMED].carry_to(other).pooled
-    own = hold_out(other.problem, fit_model(other.problem, one.models[NAMED])).pooled
+    own = hold_out(other.data, fit_model(other.data, one.models[NAMED])).pooled
     return [getattr(carried, metric) / getattr(own, metric) for metric in METRICS]
 
 

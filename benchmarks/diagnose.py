@@ -28,7 +28,7 @@ STAGES = {
         "pipeline.estimation.stored_diagnosis.read_recording",
         "pipeline.run.motion_run.load_run",
     ),
-    "make runs ready": ("pipeline.estimation.problem.prepare_problem",),
+    "make runs ready": ("pipeline.estimation.estimation_data.prepare_data",),
     "search: candidates on one model": ("pipeline.estimation.candidates.Screen.__init__",),
     "search: rough fits": ("pipeline.estimation.fit.approach",),
     "search: fits of extensions": ("pipeline.estimation.decision.Search._judge_extensions",),

@@ -18,11 +18,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 from measuring import RECORDINGS
 from real_recordings import CASES, Reached, Recordings, make_model, measure
 
-from pipeline.estimation import Problem, climb
+from pipeline.estimation import EstimationData, climb
 
 
 def describe_values(reached: Reached) -> str:
-    timing, late = reached.fitted.state.timing[0], reached.problem.runs[0].alignment.heading_delay_s
+    timing, late = reached.fitted.state.timing[0], reached.data.runs[0].alignment.heading_delay_s
     parts = [
         f"{effect.id} " + " ".join(f"{name}={value:.3g}" for name, value in effect.values.items())
         for effect in reached.fitted.model.effects
@@ -52,7 +52,9 @@ def run(given: argparse.Namespace) -> None:
         for case in chosen:
             driven, vehicle = recordings.load(case.log)
             if given.ladders:
-                ladder = climb(Problem([driven], vehicle, case.source), make_model(vehicle, case.effects))
+                ladder = climb(
+                    EstimationData([driven], vehicle, case.source), make_model(vehicle, case.effects)
+                )
                 errors = [rung.errors.t_mrmse_m for rung in ladder.steps]
                 fell = "falls" if errors == sorted(errors, reverse=True) else "RISES"
                 names = ["ideal", *ladder.steps[-1].effects]

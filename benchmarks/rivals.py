@@ -34,7 +34,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
-from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
+from pipeline.estimation import EstimationData, Fitted, HeldOut, Input, hold_out
 from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
 from pipeline.estimation.rivals import (
     Contest,
@@ -86,10 +86,10 @@ class Entry:
         """Its errors on another recording: clocks are fitted there, all else is as it is."""
         model = self.fitted.model
         clocks = [f"{e.id}.{name}" for e in model if e.late is Late.POSES for name in e.values]
-        there = fit_as_it_is(other.problem, model, clocks)
+        there = fit_as_it_is(other.data, model, clocks)
         if self.learned is None:
-            return hold_out(other.problem, there)
-        return score_learned(other.problem, there.state, self.learned)
+            return hold_out(other.data, there)
+        return score_learned(other.data, there.state, self.learned)
 
 
 class Recording:
@@ -105,7 +105,7 @@ class Recording:
         self.vehicle = load_vehicle(manifest)
         run = load_motion_run(manifest, self.vehicle)
         self.terrain, self.duration_s = run.terrain, run.duration_s
-        self.problem = Problem([run], self.vehicle, source)
+        self.data = EstimationData([run], self.vehicle, source)
         self.models = {NAMED: Model(self.vehicle, file.model.effects)}
         self.models |= {model.name: model.make(self.vehicle) for model in list_models(self.vehicle)}
         self._learns = learns
@@ -115,14 +115,14 @@ class Recording:
         """All models, fitted to the recording."""
         found = {}
         for name, model in self.models.items():
-            fitted, fit_s = time_fit(self.problem, model)
+            fitted, fit_s = time_fit(self.data, model)
             numbers = len({number.label for number in fitted.free if number.effect})
-            found[name] = Entry(Rival(name, numbers, hold_out(self.problem, fitted), fit_s), fitted)
+            found[name] = Entry(Rival(name, numbers, hold_out(self.data, fitted), fit_s), fitted)
         found[KEPT] = self._keep_term(found[NAMED])
         if not self._learns:
             return found
         for learner in list_learners():
-            lesson = Lesson(self.problem, learner)
+            lesson = Lesson(self.data, learner)
             found[learner.name] = self._learn(learner.name, found[IDEAL].fitted, lesson)
             if learner.name == TREES:
                 found[BEYOND] = self._learn(BEYOND, found[NAMED].fitted, lesson)
@@ -131,17 +131,17 @@ class Recording:
     def _keep_term(self, named: Entry) -> Entry:
         """The named physics with a learned term where that helps."""
         begun = time.process_time()
-        rung = make_learned_step(self.problem, named.fitted, named.rival.held_out)
+        rung = make_learned_step(self.data, named.fitted, named.rival.held_out)
         fitted = named.fitted if rung.refusal else add_term(named.fitted, rung.term)
         fit_s = named.rival.fit_s + time.process_time() - begun
-        held_out = hold_out(self.problem, named.fitted, learn_where_it_helps(self.problem))
+        held_out = hold_out(self.data, named.fitted, learn_where_it_helps(self.data))
         return Entry(Rival(KEPT, None, held_out, fit_s), fitted)
 
     def _learn(self, name: str, fitted: Fitted, lesson: Lesson) -> Entry:
         begun = time.process_time()
-        learned = lesson.learn(fitted.state, np.ones(self.problem.whole.run.size, dtype=bool))
+        learned = lesson.learn(fitted.state, np.ones(self.data.whole.run.size, dtype=bool))
         fit_s = time.process_time() - begun
-        rival = Rival(name, None, hold_out(self.problem, fitted, lesson.learn_fold), fit_s)
+        rival = Rival(name, None, hold_out(self.data, fitted, lesson.learn_fold), fit_s)
         return Entry(rival, fitted, learned)
 
     def contest(self, source: Recording | None = None) -> tuple[Contest, dict[str, float]]:
@@ -159,7 +159,7 @@ class Recording:
         held = {
             name: _share_below(rivals[name].list_errors("t_mrmse_m"), band) for name, band in bands.items()
         }
-        return hold_contest(self.problem, list(rivals.values())), held
+        return hold_contest(self.data, list(rivals.values())), held
 
 
 def _share_below(errors: Floats, band: float) -> float:
@@ -209,7 +209,7 @@ def judge(target: Recording, place: str, donor: Recording | None) -> dict[str, o
         "run": target.name,
         "vehicle": target.vehicle.id,
         "terrain": target.terrain,
-        "input": target.problem.source.value,
+        "input": target.data.source.value,
         "minutes": round(target.duration_s / 60.0, 1),
         "place": place,
         "donor": "" if donor is None else donor.name,

@@ -23,7 +23,7 @@ os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Problem, choose_input, fit_model
+from pipeline.estimation import EstimationData, choose_input, fit_model
 from pipeline.estimation.held_out import score
 from pipeline.models import Model, find_effect
 from pipeline.run import load_motion_run
@@ -116,10 +116,10 @@ def answer_anew(manifest: Manifest) -> None:
     """What a moved value does to the error, with nothing kept ready."""
     vehicle = load_vehicle(manifest)
     run = load_motion_run(manifest, vehicle)
-    problem = Problem([run], vehicle, choose_input([run]).source)
-    fit_model(problem, Model(vehicle))
+    data = EstimationData([run], vehicle, choose_input([run]).source)
+    fit_model(data, Model(vehicle))
     model = Model(vehicle, (find_effect("effective_track")(k=1.6),))
-    score(problem, problem.start_state(model))
+    score(data, data.start_state(model))
 
 
 def press_in_browser(server: Workbench, run: str) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from game.draw import Answer
-from pipeline.estimation import Input, Problem, Recording, fit_model, hold_out, load_recording
+from pipeline.estimation import EstimationData, Input, Recording, fit_model, hold_out, load_recording
 from pipeline.estimation.errors import measure_errors
 from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
 from pipeline.models.effect import Late, find_late
@@ -86,7 +86,7 @@ def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Ans
     run = load_recording(recording, vehicle)
     vehicle = run.correct_vehicle(vehicle)
     try:
-        problem = Problem(
+        data = EstimationData(
             [run],
             vehicle,
             Input.COMMAND,
@@ -96,19 +96,19 @@ def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Ans
     except MotionError:
         return Checked()
     true = list(build_true(answer, run.duration_s))
-    ideal = _judge(problem, Model(vehicle))
-    best = _judge(problem, Model(vehicle, tuple(true))) if true else None
-    found = _judge(problem, Model(vehicle, tuple(named))) if named else ideal
+    ideal = _judge(data, Model(vehicle))
+    best = _judge(data, Model(vehicle, tuple(true))) if true else None
+    found = _judge(data, Model(vehicle, tuple(named))) if named else ideal
     without: dict[str, Held] = {}
     if len(true) > 1:
         without = {
-            effect.id: _judge(problem, Model(vehicle, tuple(e for e in true if e is not effect)))
+            effect.id: _judge(data, Model(vehicle, tuple(e for e in true if e is not effect)))
             for effect in true
         }
     clock = find_late(true, Late.POSES)
     if clock is not None and run.gyro_fit is not None:
-        without[clock.id] = _judge_late(problem, Model(vehicle, tuple(true)))
-    return Checked(ideal, best, found, _judge_formula(problem, Model(vehicle, tuple(named)), told), without)
+        without[clock.id] = _judge_late(data, Model(vehicle, tuple(true)))
+    return Checked(ideal, best, found, _judge_formula(data, Model(vehicle, tuple(named)), told), without)
 
 
 def build_true(answer: Answer, duration_s: float) -> tuple[Effect, ...]:
@@ -116,30 +116,30 @@ def build_true(answer: Answer, duration_s: float) -> tuple[Effect, ...]:
     return tuple(_place_change(_build(name, values), duration_s) for name, values in answer.effects.items())
 
 
-def _judge(problem: Problem, model: Model) -> Held:
-    errors = hold_out(problem, fit_model(problem, model)).pooled
+def _judge(data: EstimationData, model: Model) -> Held:
+    errors = hold_out(data, fit_model(data, model)).pooled
     return Held(errors.t_mrmse_m, errors.r_mrmse_rad, *errors.velocity_rms)
 
 
-def _judge_late(problem: Problem, fitted: Model) -> Held:
+def _judge_late(data: EstimationData, fitted: Model) -> Held:
     """A model on poses that stand where they were stamped, in sample."""
-    state = fit_model(problem, fitted).state
-    late = -problem.runs[0].alignment.heading_delay_s
-    comparison = problem.comparisons[0]
-    reach = comparison.find_horizon_errors(state.effects, state.timing[0], late)
-    residuals = comparison.find_residuals(state.effects, state.timing[0], late)
+    state = fit_model(data, fitted).state
+    late = -data.runs[0].alignment.heading_delay_s
+    run_residuals = data.residuals_by_run[0]
+    reach = run_residuals.find_horizon_errors(state.effects, state.timing[0], late)
+    residuals = run_residuals.find_residuals(state.effects, state.timing[0], late)
     errors = measure_errors(residuals, reach.position, reach.yaw)
     return Held(errors.t_mrmse_m, errors.r_mrmse_rad, *errors.velocity_rms)
 
 
-def _judge_formula(problem: Problem, model: Model, told: Json) -> Held | None:
+def _judge_formula(data: EstimationData, model: Model, told: Json) -> Held | None:
     """The model file with the formula pasted at its end, as a user would."""
     flagged = told.get("unexplained")
     formula = flagged.get("formula") if isinstance(flagged, Mapping) else None
     if not isinstance(formula, str):
         return None
     pasted = parse_model(format_model(ModelFile(model)) + "\n" + formula, Path("pasted.toml"))
-    return _judge(problem, pasted.model)
+    return _judge(data, pasted.model)
 
 
 def _build(name: str, values: Mapping[str, float]) -> Effect:

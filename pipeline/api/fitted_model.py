@@ -14,13 +14,13 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.core import INPUT_WORDS, number_in, objects_in
 from pipeline.datasets import ModelFit, fit_to_runs, read_runs
-from pipeline.estimation import Problem, State
+from pipeline.estimation import EstimationData, ModelState
 from pipeline.estimation.additions import Tries
-from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
+from pipeline.estimation.run_residuals import choose_input
 from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.estimation.transfer import carry_over, fit_as_it_is
@@ -292,10 +292,10 @@ class Model:
         Raises:
             SlipError: the run has no such input, is too short, or is of another vehicle.
         """
-        problem, state = self._prepare(run, input, vehicle_of)
-        slip = run.slip.filter(pl.col("input").cast(pl.String) == problem.source.value).collect()
+        data, state = self._prepare(run, input, vehicle_of)
+        slip = run.slip.filter(pl.col("input").cast(pl.String) == data.source.value).collect()
         velocity = predict_at_from(
-            problem.comparisons[0], state.effects_of(0), state.timing[0], slip["t"].to_numpy()
+            data.residuals_by_run[0], state.effects_of(0), state.timing[0], slip["t"].to_numpy()
         )
         names = [f"{kind}_{axis}" for kind in ("v", "f") for axis in COMPONENTS]
         made = [pl.Series(f"model_{axis}", velocity[:, i]) for i, axis in enumerate(COMPONENTS)]
@@ -325,16 +325,16 @@ class Model:
         Raises:
             SlipError: the run has no such input, is too short, or is of another vehicle.
         """
-        problem, state = self._prepare(run, input, vehicle_of)
-        model = replace(self.file.model, vehicle=problem.vehicle, effects=state.effects_of(0))
+        data, state = self._prepare(run, input, vehicle_of)
+        model = replace(self.file.model, vehicle=data.vehicle, effects=state.effects_of(0))
         with threadpool_limits(1):
-            tries = Tries(problem, model, run.find_suggestion(problem.vehicle))
+            tries = Tries(data, model, run.find_suggestion(data.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
         without = errors_as_json(tries.before)
         rows = [
             {
                 "effect": one.effect.id,
-                "sentence": one.effect.describe_motion(problem.vehicle, model),
+                "sentence": one.effect.describe_motion(data.vehicle, model),
                 **{name: errors[name] for name in _OVER_2S},
                 **{f"{name[0]}_removed": _find_removed(errors, without, name) for name in _OVER_2S},
                 "same_as": list(one.twins),
@@ -350,22 +350,24 @@ class Model:
         self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
     ) -> MotionView:
         """Its motion on a run, with its values as they are, as rows for figures."""
-        problem, state = self._prepare(run, input, vehicle_of)
+        data, state = self._prepare(run, input, vehicle_of)
         known = run.manifest.tables
         places = (
             run.table("velocities").select("t", "x", "y").sort("t").collect()
             if "velocities" in known
             else None
         )
-        return MotionStage(problem, places).view(state, (), None)
+        return MotionStage(data, places).view(state, (), None)
 
-    def _prepare(self, run: StoredRun, input: Source | None, owner: Owner | None) -> tuple[Problem, State]:
-        """The run as a problem, and the model on it: its values as they are, the run's own delays."""
+    def _prepare(
+        self, run: StoredRun, input: Source | None, owner: Owner | None
+    ) -> tuple[EstimationData, ModelState]:
+        """The run as estimation data, and the model on it: its values as they are, the run's own delays."""
         file, read = self._read(run, owner)
         source = choose_input(read, input, file.model, last=file.last_input).source
-        problem = Problem(read, file.model.vehicle, source)
+        data = EstimationData(read, file.model.vehicle, source)
         with threadpool_limits(1):
-            return problem, fit_as_it_is(problem, file.model, file.per_run).state
+            return data, fit_as_it_is(data, file.model, file.per_run).state
 
     def export(
         self,
@@ -463,7 +465,7 @@ class Fit:
         return "\n".join([repr(self.model), *format_ladder(self._fit.after.ladder, self._fit.floor)])
 
     def _repr_html_(self) -> str:
-        chosen, names = self._fit.chosen, ", ".join(self._fit.after.problem.names)
+        chosen, names = self._fit.chosen, ", ".join(self._fit.after.data.names)
         notes = [chosen.warning] if chosen.warning else []
         title = f"fitted {INPUT_WORDS[chosen.source.value]} of {names} ({chosen.reason})"
         return write_html(title, self.model.parameters) + write_html("held-out errors", self.ladder, notes)

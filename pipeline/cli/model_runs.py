@@ -26,7 +26,7 @@ from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError, format_count
 
 if TYPE_CHECKING:
     from pipeline.datasets import Forecast
-    from pipeline.estimation.problem import Problem
+    from pipeline.estimation.estimation_data import EstimationData
     from pipeline.models import LiteratureModel, Model, ModelFile
     from pipeline.run import MotionRun
     from pipeline.sources import Owner, Vehicle
@@ -225,20 +225,20 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     Raises:
         MotionError: the target writes none, or a run has no measured wheels; others as `gather_runs`.
     """
-    from pipeline.estimation.comparison import Input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.ladder import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.estimation.estimation_data import EstimationData  # noqa: PLC0415
+    from pipeline.estimation.ladder import assess_model, note_fit  # noqa: PLC0415
     from pipeline.estimation.odometry_noise import measure_alphas  # noqa: PLC0415
-    from pipeline.estimation.problem import Problem  # noqa: PLC0415
+    from pipeline.estimation.run_residuals import Input  # noqa: PLC0415 - heavy
     from pipeline.export import require_errors  # noqa: PLC0415
 
     require_errors(target)
     vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)
     file = replace(file, model=replace(file.model, vehicle=vehicle))
-    problem = Problem(runs, vehicle, Input.MEASURED)
-    judgement = judge_model(problem, file.model, per_run=file.per_run)
-    noted = note_fit(file, judgement)
-    steps = zip(noted.list_fitted("ladder"), judgement.ladder.steps, strict=True)
-    ladder = [{**row, "odometry_alphas": measure_alphas(problem, step.fitted)} for row, step in steps]
+    data = EstimationData(runs, vehicle, Input.MEASURED)
+    assessment = assess_model(data, file.model, per_run=file.per_run)
+    noted = note_fit(file, assessment)
+    steps = zip(noted.list_fitted("ladder"), assessment.ladder.steps, strict=True)
+    ladder = [{**row, "odometry_alphas": measure_alphas(data, step.fitted)} for row, step in steps]
     return replace(noted, fit={**noted.fit, "ladder": ladder})
 
 
@@ -346,7 +346,7 @@ def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: 
     Raises:
         SlipError: a log cannot be read, runs are of several vehicles, or there is no fleet.
     """
-    from pipeline.estimation.comparison import choose_input  # noqa: PLC0415
+    from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415
     from pipeline.models import Model, ModelFile  # noqa: PLC0415 - heavy
 
     vehicle, runs = gather_runs(names, None, None, out, quiet=quiet)
@@ -354,24 +354,24 @@ def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: 
     return ModelFile(Model(vehicle, forecast_runs(runs, vehicle, chosen.source.value, out).effects))
 
 
-def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
-    """The problem with the fleet's forecast as prior.
+def tie_to_fleet(data: EstimationData, model: Model, out: Path) -> EstimationData:
+    """The data with the fleet's forecast as prior.
 
     Raises:
         SlipError: see `forecast_runs`.
     """
     from pipeline.estimation.across_runs import tie_to_prior  # noqa: PLC0415 - heavy
 
-    forecast = forecast_runs(problem.runs, model.vehicle, problem.source.value, out)
-    return tie_to_prior(problem, forecast.prior)
+    forecast = forecast_runs(data.runs, model.vehicle, data.source.value, out)
+    return tie_to_prior(data, forecast.prior)
 
 
-def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
+def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:
     """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
     from pipeline.models import cut_interval, find_effect  # noqa: PLC0415 - heavy
 
     values: dict[str, dict[str, object]] = {}
-    for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
+    for label, (mean, deviation) in data.paths[0].prior.numbers.items():
         effect, _, name = label.partition(".")
         half = NORMAL_95 * deviation
         parameter = find_effect(effect)().parameter(name)

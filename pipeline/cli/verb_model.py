@@ -230,8 +230,8 @@ def compare(  # noqa: D417 - the shared options document themselves
         other: another one.
     """
     from pipeline.estimation.across_runs import describe_coverage  # noqa: PLC0415
-    from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.learned_step import check_bands  # noqa: PLC0415
+    from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
 
     paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
@@ -289,7 +289,7 @@ def speed(  # noqa: D417 - the shared options document themselves
         within: largest error of the predicted position, for example 10cm.
         ahead: how far ahead, up to 2s.
     """
-    from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415
     from pipeline.words import format_speed_limits  # noqa: PLC0415
 
@@ -393,7 +393,7 @@ def _change(
         after,
         runs if first_s is None else cut_first(runs, first_s),
         spoken.input,
-        None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.results),
+        None if prior is None else lambda data: tie_to_fleet(data, model, spoken.results),
     )
     refusals = fit.explain_refusals()
     if must_help and refusals:
@@ -411,7 +411,7 @@ def _change(
             {
                 "model": None if path is None else str(path),
                 **fit.to_json(),
-                "prior": prior_as_json(fit.after.problem),
+                "prior": prior_as_json(fit.after.data),
                 "carried_over": [_transfer_as_json(str(path), item) for item in carried],
                 "warnings": [*before.warnings, *warnings],
             }
@@ -473,9 +473,9 @@ def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     )
 
     old, new, chosen = fit.before, fit.after, fit.chosen
-    runs = ", ".join(new.problem.names)
+    runs = ", ".join(new.data.names)
     lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
-    lines += format_recordings([comparison.run for comparison in new.problem.comparisons])
+    lines += format_recordings([run_residuals.run for run_residuals in new.data.residuals_by_run])
     if old is not new:
         lines += ["", "before", *format_ladder(old.ladder, fit.floor), "", "after"]
     lines += format_ladder(new.ladder, fit.floor)
@@ -484,7 +484,7 @@ def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = parameters_as_json(new.fitted.model, new.estimates)
-    prior = prior_as_json(new.problem)
+    prior = prior_as_json(new.data)
     lines += ["", "parameters", *format_parameters(parameters)]
     return [*lines, "", "prior", *format_parameters(prior)] if prior else lines
 

@@ -516,8 +516,8 @@ def _measure_moves(sides: Sides, changes: Mapping[str, Change]) -> tuple[float, 
                 values.setdefault(label.effect.id, {})[label.parameter.name] = number
             effects = fitted.state.effects_of(0)
             both.append([one.change(**values[one.id]) if one.id in values else one for one in effects])
-        comparison = fitted.problem.comparisons[0]
-        shifts.append(comparison.find_horizon_shifts(both[1], both[0], fitted.state.timing[0])[:2])
+        run_residuals = fitted.data.residuals_by_run[0]
+        shifts.append(run_residuals.find_horizon_shifts(both[1], both[0], fitted.state.timing[0])[:2])
     if not shifts:
         return None
     far, turned = (float(np.sqrt(np.mean(np.concatenate(one) ** 2))) for one in zip(*shifts, strict=True))

@@ -19,11 +19,11 @@ from pipeline.core import (
 )
 from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.commanded import measure_commanded_turn
-from pipeline.estimation.comparison import Input
-from pipeline.estimation.fit import fit_part
-from pipeline.estimation.intervals import Estimate, estimate_part
+from pipeline.estimation.estimation_data import EstimationData
+from pipeline.estimation.fit import fit_path
+from pipeline.estimation.intervals import Estimate, estimate_path
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import Problem
+from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, Parameter, is_of_one_run
 from pipeline.run import MotionRun
 
@@ -165,15 +165,15 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
     Raises:
         MotionError: the run lacks the input, or is too short.
     """
-    problem = Problem([run], model.vehicle, source)
-    fitted = fit_model(problem, model)
+    data = EstimationData([run], model.vehicle, source)
+    fitted = fit_model(data, model)
     names = [label.name for label in labels]
     count = len(names) + len(LOGARITHMS)
     values, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
     for fit in fitted.fits:
         if not fit.free:
             continue
-        estimates = estimate_part(fit)
+        estimates = estimate_path(fit)
         common = [
             (index, item)
             for index, item in enumerate(estimates.items)
@@ -220,7 +220,7 @@ def widen(reading: RunReading, labels: Sequence[Label], others: Mapping[str, flo
             if effect is not None and label.name in {free.label for free in fit.free}:
                 name = label.parameter.name
                 moved = effect.change(**{name: others[label.name]}).fix(name)
-                risen = fit_part(fit.part, fit.state.add(moved), noise=fit.noise).score - fit.score
+                risen = fit_path(fit.path, fit.state.add(moved), noise=fit.noise).score - fit.score
                 deviations = math.sqrt(max(risen / fit.overdispersion, _LEAST_RISE))
                 factors[index] = max(abs(away) / deviations / error, 1.0)
     covariance = numbers.covariance * np.outer(factors, factors)
@@ -233,13 +233,13 @@ def _is_known(item: Estimate) -> bool:
 
 def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
     """Logarithms of the errors divided by the speed, with their standard deviations, and the speed [m/s]."""
-    problem, state = fitted.problem, fitted.state
-    comparison = problem.comparisons[0]
-    errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
-    begin = comparison.run.start_s
-    stretch = _number(comparison.horizons.times[:, 0] - begin)
-    asked = (problem.whole.find_ideal()[:, 0] ** 2).sum(axis=1)
-    driven = _number(problem.whole.times[:, 0] - begin)
+    data, state = fitted.data, fitted.state
+    run_residuals = data.residuals_by_run[0]
+    errors = run_residuals.find_horizon_errors(state.effects_of(0), state.timing[0])
+    begin = run_residuals.run.start_s
+    stretch = _number(run_residuals.horizons.times[:, 0] - begin)
+    asked = (data.whole.find_ideal()[:, 0] ** 2).sum(axis=1)
+    driven = _number(data.whole.times[:, 0] - begin)
     present, both = np.unique(np.concatenate((stretch, driven)), return_inverse=True)
     stretch, driven = np.split(both, [stretch.size])
     count = present.size

@@ -26,7 +26,7 @@ from pipeline.datasets.check_readings import (
 from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.stored_fits import read_runs
-from pipeline.estimation.comparison import Input, choose_input
+from pipeline.estimation.run_residuals import Input, choose_input
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
 from pipeline.models import (
     Effect,

@@ -30,8 +30,8 @@ from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast,
 from pipeline.datasets.levels import draw_run
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError
 from pipeline.datasets.rank_tests import Interval
-from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.prediction import predict_at_from, predict_from
+from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.models import Effect, Model, ModelFile, Timing, cut_interval, find_effect
 from pipeline.run import TABLE_COLUMNS, MotionError, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
@@ -267,7 +267,7 @@ class _Driven:
 
     Attributes:
         manifest: its results.
-        comparison: the run with the chosen input.
+        run_residuals: the run with the chosen input.
         error_m: error of its own model over 2 s [m].
         times: times of its slip samples [s], shape (n,).
         ideal: ideal velocity at these times, shape (n, 3); `residual`: measured velocity minus own model.
@@ -275,7 +275,7 @@ class _Driven:
     """
 
     manifest: Manifest
-    comparison: Comparison
+    run_residuals: RunResiduals
     error_m: float
     times: Floats
     ideal: Floats
@@ -307,7 +307,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     rng = np.random.default_rng(seed)
     paces = np.log([max(run.pace, 1e-6) for run in runs])
     logs = np.log([max(run.error_m, 1e-6) for run in runs]) - paces
-    length = [max(run.comparison.run.duration_s / STRETCH_S, 1.0) for run in runs]
+    length = [max(run.run_residuals.run.duration_s / STRETCH_S, 1.0) for run in runs]
     terrains = [str(run.manifest.details.get("terrain")) for run in runs]
     sizes = draw_run(
         logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,
@@ -330,7 +330,9 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         errors = [_measure_gap(truth, side) for side in (known[choice], ideal[choice])]
         grown = math.exp(size - float(logs[choice]))
         slip = (
-            run.ideal - predict_at_from(run.comparison, effects, Timing(), run.times) - grown * run.residual
+            run.ideal
+            - predict_at_from(run.run_residuals, effects, Timing(), run.times)
+            - grown * run.residual
         )
         modulus = np.linalg.norm(slip * run.scale, axis=1)
         residual = math.exp(size + float(paces[choice]))
@@ -338,7 +340,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         numbers[which] = math.exp(float(comes[which] - paces[choice])) * np.array(errors_out)
     error, without, modulus_median = (_bound(column) for column in numbers.T)
     used = tuple(run.manifest.run for run in runs)
-    vehicle = runs[0].comparison.context.vehicle
+    vehicle = runs[0].run_residuals.context.vehicle
     notes = compared.notes if forecast.here else (*compared.notes, _note_terrain(compared.labels, forecast))
     return Prediction(forecast, vehicle, error, without, modulus_median, used, notes)
 
@@ -376,7 +378,7 @@ def _bound(draws: Floats) -> Expected:
 
 def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
     """Positions of predictions over 2 s [m], by prediction and time since its start (x + iy)."""
-    poses = predict_from(run.comparison, effects, Timing()).poses
+    poses = predict_from(run.run_residuals, effects, Timing()).poses
     return poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
 
 
@@ -412,23 +414,23 @@ def _load_runs(compared: ComparedRuns, forecast: Forecast) -> list[_Driven]:
 
 def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven:
     vehicle = load_vehicle(manifest)
-    comparison = Comparison(load_motion_run(manifest, vehicle), vehicle, source)
+    run_residuals = RunResiduals(load_motion_run(manifest, vehicle), vehicle, source)
     values: dict[str, dict[str, float]] = {}
     for effect, parameter, value in named.select("effect", "parameter", "value").iter_rows():
         low, high = find_effect(effect)().parameter(parameter).bounds
         values.setdefault(effect, {})[parameter] = min(max(value, low), high)
-    own = comparison.list_active(make_effects(values))
-    error = comparison.find_horizon_errors(own, Timing()).position
+    own = run_residuals.list_active(make_effects(values))
+    error = run_residuals.find_horizon_errors(own, Timing()).position
     slip = manifest.read("slip").filter(~pl.col("suspect"), pl.col("input").cast(pl.String) == source.value)
     times = slip["t"].to_numpy()
     measured = slip.select("v_x", "v_y", "v_w").to_numpy()
     return _Driven(
         manifest=manifest,
-        comparison=comparison,
+        run_residuals=run_residuals,
         error_m=float(np.sqrt(np.mean(error**2))),
         times=times,
         ideal=slip.select("f_x", "f_y", "f_w").to_numpy(),
-        residual=measured - predict_at_from(comparison, own, Timing(), times),
+        residual=measured - predict_at_from(run_residuals, own, Timing(), times),
         scale=np.array([1.0, 1.0, read_length_scale(manifest)]),
     )
 

@@ -7,13 +7,12 @@ from typing import Literal
 from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
-from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.errors import Errors, errors_as_json
 from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
+from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import measure_by_terrain
-from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, note_fit, step_as_json
+from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, note_fit, step_as_json
 from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
-from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
     Contest,
     contest_as_json,
@@ -24,6 +23,7 @@ from pipeline.estimation.rivals import (
     list_learners,
     time_fit,
 )
+from pipeline.estimation.run_residuals import InputChoice, choose_input
 from pipeline.models import Effect, ModelFile, drop_learned, find_learned, list_models
 from pipeline.run import MotionError, MotionRun, load_motion_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
@@ -42,8 +42,8 @@ class ModelFit:
     """
 
     file: ModelFile
-    before: Judgement
-    after: Judgement
+    before: ModelAssessment
+    after: ModelAssessment
     chosen: InputChoice
 
     @property
@@ -54,15 +54,15 @@ class ModelFit:
     def explain_refusals(self) -> dict[str, str]:
         """Reasons why added effects do not reduce the held-out error, by id; empty if they do."""
         before, after = self.before.whole, self.after.whole
-        return explain_refusals(self.after.problem, before, after, lambda: self.file.intervals)
+        return explain_refusals(self.after.data, before, after, lambda: self.file.intervals)
 
     def to_json(self) -> dict[str, object]:
         """The keys of `slip model fit --json` that the fit provides."""
-        problem, whole = self.after.problem, self.after.whole
+        data, whole = self.after.data, self.after.whole
         return {
             "input": self.chosen.source.value,
             "input_reason": self.chosen.reason,
-            "runs": list(problem.names),
+            "runs": list(data.names),
             "ladder_before": ladder_as_json(self.before.ladder, self.floor),
             "ladder": ladder_as_json(self.after.ladder, self.floor),
             "step": step_as_json(self.before.whole, whole),
@@ -71,25 +71,25 @@ class ModelFit:
             "not_fitted": list(self.chosen.idle),
             "by_run": {
                 name: errors_as_json(errors)
-                for name, errors in zip(problem.names, whole.held_out.by_run, strict=True)
+                for name, errors in zip(data.names, whole.held_out.by_run, strict=True)
             },
             "by_terrain": {
                 terrain: errors_as_json(errors)
-                for terrain, errors in measure_by_terrain(problem, whole.held_out).items()
+                for terrain, errors in measure_by_terrain(data, whole.held_out).items()
             },
             "noise_floor": errors_as_json(self.floor),
             "parameters": parameters_as_json(self.after.fitted.model, self.after.estimates),
             "correlated": correlations_as_json(self.after.estimates),
             "timing": [
                 {
-                    "run": comparison.run.name,
-                    "pose_delay_s": comparison.run.alignment.heading_delay_s,
+                    "run": run_residuals.run.name,
+                    "pose_delay_s": run_residuals.run.alignment.heading_delay_s,
                     "wheel_delay_s": timing.wheel_delay_s,
-                    "latency_spread_s": comparison.run.alignment.latency_spread_s,
-                    "outlier_s": comparison.run.alignment.outlier_s,
+                    "latency_spread_s": run_residuals.run.alignment.latency_spread_s,
+                    "outlier_s": run_residuals.run.alignment.outlier_s,
                 }
-                for comparison, timing in zip(
-                    problem.comparisons, self.after.fitted.state.timing, strict=True
+                for run_residuals, timing in zip(
+                    data.residuals_by_run, self.after.fitted.state.timing, strict=True
                 )
             ],
         }
@@ -125,7 +125,7 @@ def fit_to_runs(
     after: ModelFile,
     runs: Sequence[MotionRun],
     source: str | None,
-    tie: Callable[[Problem], Problem] | None = None,
+    tie: Callable[[EstimationData], EstimationData] | None = None,
 ) -> ModelFit:
     """Fit a model, and evaluate it before and after a change.
 
@@ -134,20 +134,20 @@ def fit_to_runs(
         after: the model to fit, with the vehicle whose geometry is used.
         runs: runs to fit it to.
         source: `command` or `measured`; None chooses.
-        tie: function that adds prior knowledge of the parameters to the problem.
+        tie: function that adds prior knowledge of the parameters to the data.
 
     Raises:
         MotionError: the runs lack the input, or are too short; ``not_fitted``, an added effect cannot act.
     """
     chosen = choose_input(runs, source, after.model, last=before.last_input)
     _require_fitted([effect for effect in after.model if effect.id not in before.model.ids], runs, chosen)
-    problem = Problem(runs, after.model.vehicle, chosen.source)
+    data = EstimationData(runs, after.model.vehicle, chosen.source)
     if tie is not None:
-        problem = tie(problem)
+        data = tie(data)
     known, physics = (drop_learned(model) for model in (before.model, after.model))
-    old = new = judge_model(problem, replace(known, vehicle=physics.vehicle), per_run=before.per_run)
+    old = new = assess_model(data, replace(known, vehicle=physics.vehicle), per_run=before.per_run)
     if physics.effects != known.effects:
-        new = judge_model(problem, physics, per_run=after.per_run)
+        new = assess_model(data, physics, per_run=after.per_run)
     if find_learned(after.model) is not None:
         # The residual of the physical model has changed: train the learned term again.
         new = judge_learned_term(new)
@@ -218,14 +218,14 @@ def contest_models(
     last = {file.last_input for file in files.values()}
     effects = [effect for file in files.values() for effect in file.model]
     chosen = choose_input(runs, source, effects, last=last.pop() if len(last) == 1 else None)
-    problem = Problem(runs, vehicle, chosen.source)
+    data = EstimationData(runs, vehicle, chosen.source)
     rivals = [
-        judge_with_term(problem, name, replace(file.model, vehicle=vehicle), file.per_run)
+        judge_with_term(data, name, replace(file.model, vehicle=vehicle), file.per_run)
         for name, file in files.items()
     ]
-    ideal, fit_s = time_fit(problem, known.pop("ideal"))
-    rivals.append(judge_fit(problem, "ideal", ideal, fit_s))
+    ideal, fit_s = time_fit(data, known.pop("ideal"))
+    rivals.append(judge_fit(data, "ideal", ideal, fit_s))
     if "literature" in against:
-        rivals += [judge_rival(problem, name, model) for name, model in known.items()]
-    rivals += [judge_learned(problem, ideal, learner) for learner in learners]
-    return ModelContest(hold_contest(problem, rivals), chosen, problem.names)
+        rivals += [judge_rival(data, name, model) for name, model in known.items()]
+    rivals += [judge_learned(data, ideal, learner) for learner in learners]
+    return ModelContest(hold_contest(data, rivals), chosen, data.names)

@@ -2,7 +2,7 @@
 
 A joint fit of one model to many runs has noise of the same kind in all of them, and of each run's own size
 (`noise.Noise`): a gentle run counts as much as a fast one, whose residuals are larger by a factor of ten.
-Runs on other grounds than the requested one may count less (`parts.weigh_runs`).
+Runs on other grounds than the requested one may count less (`path_residuals.weigh_runs`).
 
 A ground parameter has one value per ground, shared by the runs on it; all other parameters belong to the
 vehicle and have one value.
@@ -23,25 +23,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core import CONFIDENCE, Floats, Ints, format_share
-from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, number_predictions
-from pipeline.estimation.parts import tie_prior
-from pipeline.estimation.problem import Problem
-from pipeline.estimation.state import Prior, State
+from pipeline.estimation.model_state import ModelState, Prior
+from pipeline.estimation.path_residuals import tie_prior
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.models import LEAST_WAY_M, Bands
 
 
-def tie_to_prior(problem: Problem, numbers: Mapping[str, tuple[float, float]]) -> Problem:
-    """The problem with a prior on the parameters of a model.
+def tie_to_prior(data: EstimationData, numbers: Mapping[str, tuple[float, float]]) -> EstimationData:
+    """The data with a prior on the parameters of a model.
 
     Args:
-        problem: the runs.
+        data: the runs.
         numbers: mean and standard deviation by label ``effect.name``.
 
     Returns:
-        The prepared runs, shared with `problem`, with the prior in every part.
+        The prepared runs, shared with `data`, with the prior in every path.
     """
-    return problem.with_parts(tuple(tie_prior(part, Prior(numbers)) for part in problem.parts))
+    return data.with_paths(tuple(tie_prior(path, Prior(numbers)) for path in data.paths))
 
 
 _ROUNDING = 1e-9
@@ -86,30 +86,32 @@ class Coverage:
     followed: float
 
 
-def list_ratios(problem: Problem, state: State, held_out: HeldOut) -> list[Ratios]:
+def list_ratios(data: EstimationData, state: ModelState, held_out: HeldOut) -> list[Ratios]:
     """Errors divided by the distance travelled, of each run.
 
     Args:
-        problem: the runs.
+        data: the runs.
         state: the model that predicts the distances.
         held_out: its held-out errors.
     """
-    stretches = number_predictions(problem)
+    stretches = number_predictions(data)
     return [
-        _divide(comparison, state, run, held_out, stretches[run])
-        for run, comparison in enumerate(problem.comparisons)
+        _divide(run_residuals, state, run, held_out, stretches[run])
+        for run, run_residuals in enumerate(data.residuals_by_run)
     ]
 
 
-def _divide(comparison: Comparison, state: State, run: int, held_out: HeldOut, stretches: Ints) -> Ratios:
+def _divide(
+    run_residuals: RunResiduals, state: ModelState, run: int, held_out: HeldOut, stretches: Ints
+) -> Ratios:
     effects = state.effects_of(run)
-    travelled_m = comparison.find_horizon_shifts(effects, effects, state.timing[run])[2] + LEAST_WAY_M
+    travelled_m = run_residuals.find_horizon_shifts(effects, effects, state.timing[run])[2] + LEAST_WAY_M
     return Ratios(
-        comparison.run.terrain,
+        run_residuals.run.terrain,
         held_out.position[run] / travelled_m,
         held_out.yaw[run] / travelled_m,
         stretches,
-        comparison.horizons.number,
+        run_residuals.horizons.number,
     )
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from pipeline.core import Floats
     from pipeline.estimation.candidates import Candidate
-    from pipeline.estimation.problem import Problem
+    from pipeline.estimation.estimation_data import EstimationData
     from pipeline.models import Conditions, Effect, Parameter
 
 Interval = tuple[float, float]
@@ -91,15 +91,15 @@ def rank_named(
     return sorted(additions, key=lambda one: one.remaining)
 
 
-def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
+def list_promising(data: EstimationData, fitted: Fitted) -> list[Candidate]:
     """Effects whose expected gain exceeds the price of their parameters, per path the largest gain first."""
-    candidates = problem.list_candidates(problem.source)
+    candidates = data.list_candidates(data.source)
     by_id = {candidate.id: candidate for candidate in candidates}
     promising = []
-    for part, fit in zip(problem.parts, fitted.fits, strict=True):
+    for path, fit in zip(data.paths, fitted.fits, strict=True):
         effects = [candidate for candidate in candidates if candidate().acts_in(fitted.model.ids)]
-        mine = [candidate for candidate in effects if part.owns(candidate())]
-        paying = [one for one in Screen(fit, mine, problem.largest).list_singles() if one.net > 0.0]
+        mine = [candidate for candidate in effects if path.owns(candidate())]
+        paying = [one for one in Screen(fit, mine, data.largest).list_singles() if one.net > 0.0]
         promising += [by_id[one.names[0]] for one in paying[:MOST_FITTED]]
     return promising
 
@@ -108,24 +108,24 @@ class Tries:
     """Effects tried one by one on top of a model.
 
     Args:
-        problem: the run.
+        data: the run.
         model: the current model.
         suggested: formulas to try beside the catalogue.
     """
 
-    def __init__(self, problem: Problem, model: Model, suggested: Sequence[Effect] = ()) -> None:
-        self._problem, self._model = problem, model
-        self._base = judge_whole(problem, model)
+    def __init__(self, data: EstimationData, model: Model, suggested: Sequence[Effect] = ()) -> None:
+        self._data, self._model = data, model
+        self._base = judge_whole(data, model)
         self._moves: dict[str, Floats] = {}
         self.before = self._base.errors
-        promising = [candidate() for candidate in list_promising(problem, self._base.fitted)]
+        promising = [candidate() for candidate in list_promising(data, self._base.fitted)]
         self.candidates = [*promising, *(one for one in suggested if one.id not in model)]
 
     def try_each(self) -> Iterator[Addition | None]:
         """Each candidate, fitted and judged; None for one that cannot be fitted to this run."""
         for candidate in self.candidates:
             try:
-                after = judge_whole(self._problem, self._model + candidate)
+                after = judge_whole(self._data, self._model + candidate)
             except (MotionError, ArithmeticError, ValueError):
                 yield None
                 continue
@@ -136,7 +136,7 @@ class Tries:
         if effect is None:
             return None
         reasons = explain_refusals(
-            self._problem,
+            self._data,
             self._base,
             after,
             lambda: estimate_intervals(after.fitted).shared_intervals,
@@ -162,7 +162,10 @@ class Tries:
 
 
 def explain_refusals(
-    problem: Problem, before: LadderStep, after: LadderStep, intervals: Callable[[], Mapping[str, Interval]]
+    data: EstimationData,
+    before: LadderStep,
+    after: LadderStep,
+    intervals: Callable[[], Mapping[str, Interval]],
 ) -> dict[str, str]:
     """Reasons why the additional effects of a larger model do not help, by id; empty where they help.
 
@@ -170,7 +173,7 @@ def explain_refusals(
     effects together, an interval that includes the neutral value.
 
     Args:
-        problem: the runs.
+        data: the runs.
         before: the smaller model.
         after: the larger one.
         intervals: computes the 95 % intervals by label ``effect.parameter``, the slowest step.
@@ -179,16 +182,16 @@ def explain_refusals(
     if not added:
         return {}
     if [one.id for one in added] == [LEARNED]:
-        stretches = np.concatenate(number_predictions(problem))
+        stretches = np.concatenate(number_predictions(data))
         said = explain_no_help(before.held_out, after.held_out, stretches)
         return {LEARNED: said} if said else {}
     idle = {one.id: explain_idle(one, after.effects) for one in added}
     if any(idle.values()):
         return {name: f"it {text}" for name, text in idle.items() if text}
-    conditions = problem.conditions
+    conditions = data.conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
         return alone
-    t = min(measure_t(fit, one) for one in added for fit in after.fitted.fits if fit.part.owns(one))
+    t = min(measure_t(fit, one) for one in added for fit in after.fitted.fits if fit.path.owns(one))
     if together := explain_errors(before.errors, after.errors, t):
         return dict.fromkeys((one.id for one in added), together)
     fitted = intervals()

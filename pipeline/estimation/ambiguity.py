@@ -11,11 +11,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from pipeline.core import Floats, Ints
-from pipeline.estimation.comparison import Input
 from pipeline.estimation.decision import LEAST_T, STABLE_T, Search, SearchResult
 from pipeline.estimation.estimates import list_first_run
-from pipeline.estimation.fit import PartFit, whiten_columns
-from pipeline.estimation.intervals import estimate_part
+from pipeline.estimation.fit import PathFit, whiten_columns
+from pipeline.estimation.intervals import estimate_path
+from pipeline.estimation.run_residuals import Input
 from pipeline.models import LEAST_DELAY_S, Effect, Late, find_late, find_late_effect, list_effects
 from pipeline.models import Search as HowSearched
 from pipeline.results import Delays, Detectable, Undecided, Unobservable, Value
@@ -23,10 +23,10 @@ from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 
 if TYPE_CHECKING:
-    from pipeline.estimation.ladder import Judgement
+    from pipeline.estimation.estimation_data import EstimationData
+    from pipeline.estimation.ladder import ModelAssessment
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.estimation.problem import Problem
-    from pipeline.estimation.state import State
+    from pipeline.estimation.model_state import ModelState
 
 DETECTED = LEAST_T + 1.3
 """Size of an effect [standard errors] that is named in nine of ten logs."""
@@ -56,14 +56,14 @@ def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]
             yield Undecided((name, *names), numbers)
 
 
-def _read_numbers(fit: PartFit, name: str) -> dict[str, Value]:
+def _read_numbers(fit: PathFit, name: str) -> dict[str, Value]:
     """Values of an effect of a model in the first run, with their intervals."""
-    return list_first_run(fit.state, estimate_part(fit))[name]
+    return list_first_run(fit.state, estimate_path(fit))[name]
 
 
-def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undecided]:
+def take_judged(items: Iterable[Undecided], assessment: ModelAssessment) -> list[Undecided]:
     """The same groups, with the values and intervals of a judged model for the effects in it."""
-    estimated = list_first_run(judgement.fitted.state, judgement.estimates)
+    estimated = list_first_run(assessment.fitted.state, assessment.estimates)
     return [
         replace(item, parameters={name: estimated.get(name, old) for name, old in item.parameters.items()})
         for item in items
@@ -100,11 +100,11 @@ class Clocks:
         ]
 
 
-def read_clocks(problem: Problem, state: State, source: Input) -> Clocks:
+def read_clocks(data: EstimationData, state: ModelState, source: Input) -> Clocks:
     """Identify clock effects: with a gyro the delays of heading and position are known separately."""
     extra = find_late(state.effects, Late.POSES)
     rows, positions, skews, certain = [], [], [], []
-    for number, (timing, run) in enumerate(zip(state.timing, problem.runs, strict=True)):
+    for number, (timing, run) in enumerate(zip(state.timing, data.runs, strict=True)):
         yaw = run.alignment.heading_delay_s
         own = find_late(state.effects_of(number), Late.POSES)
         heading_delay = own.delay if own is not None else 0.0
@@ -123,14 +123,14 @@ def read_clocks(problem: Problem, state: State, source: Input) -> Clocks:
     late_effects: list[Effect] = []
     late, heading_delay = float(np.mean(positions)), float(np.mean(skews))
     # Only a heading older than its position is reported as such; the opposite is a late position.
-    skewed = extra is not None and problem.has_gyro and heading_delay < 0.0
+    skewed = extra is not None and data.has_gyro and heading_delay < 0.0
     if skewed:
         late_effects.append(find_late_effect(Late.HEADING).of_delay(-heading_delay))
     least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
-    known = extra is not None if not problem.has_gyro else any(certain)
+    known = extra is not None if not data.has_gyro else any(certain)
     if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
-        if problem.has_gyro and not problem.largest.moves_both_ways:
+        if data.has_gyro and not data.largest.moves_both_ways:
             # The gyro gives the heading delay; relating it to the position clock needs driving and turning.
             skew = find_late_effect(Late.HEADING)()
             return Clocks(tuple(late_effects), tuple(rows), (Undecided((clock.id, skew.id)),))
@@ -158,9 +158,9 @@ def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
     return list(joined.values())
 
 
-def list_equivalents(effect: Effect, problem: Problem) -> tuple[str, ...]:
+def list_equivalents(effect: Effect, data: EstimationData) -> tuple[str, ...]:
     """Effects equivalent to this one under the conditions of the recordings."""
-    return effect.equivalent_to if effect.is_equivalent(problem.conditions) else ()
+    return effect.equivalent_to if effect.is_equivalent(data.conditions) else ()
 
 
 def find_unobservable(
@@ -171,16 +171,16 @@ def find_unobservable(
     Returns:
         These, and the detection thresholds of the other effects that are linear in one parameter.
     """
-    fit, part = outcome.screen.saturated, search.part
+    fit, path = outcome.screen.saturated, search.path
     own = fit.white.columns
     basis = np.linalg.qr(own / (np.linalg.norm(own, axis=0) + 1e-12))[0] if own.size else own
-    unit = part.unit[fit.white.rows]
+    unit = path.unit[fit.white.rows]
     unobservable, seen = dict[str, Unobservable](), list[Detectable]()
     for candidate in search.candidates:
         if candidate.id in fit.ids or not candidate().acts_in(fit.ids):
             continue
         usual = candidate().make_usual(search.conditions.largest)
-        shift = fit.residual - part.find_residuals(fit.state.add(usual))
+        shift = fit.residual - path.find_residuals(fit.state.add(usual))
         column = whiten_columns(fit, shift[:, :, None])[:, 0]
         beside = column - basis @ (basis.T @ column) if own.size else column
         if _is_seen(beside, unit):

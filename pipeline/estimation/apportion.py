@@ -24,9 +24,9 @@ from pipeline.core import (
     nearest_indices,
     student_quantile,
 )
+from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, score
-from pipeline.estimation.ladder import Judgement
-from pipeline.estimation.problem import Problem
+from pipeline.estimation.ladder import ModelAssessment
 from pipeline.results import ABOVE_FLOOR, Moments, Share, SlipBudget, Span
 from pipeline.run import HORIZON_S
 
@@ -39,32 +39,32 @@ _ALL_ORDERS = 5
 """Largest number of effects for which all orders are used: 120 orders of 32 sets."""
 
 
-def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
+def apportion(assessment: ModelAssessment, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
     """The budgets of a judged model: of the slip, and of the 2 s errors of position and heading.
 
     The ideal and the whole model are the first and last steps of the ladder, so that totals and remainders
     equal those of the ladder. The models in between are the whole model without some effects.
 
     Args:
-        judgement: the model on its runs.
+        assessment: the model on its runs.
         length_scale_m: of the slip modulus [m].
     """
-    problem, fitted = judgement.problem, judgement.fitted
+    data, fitted = assessment.data, assessment.fitted
     players = fitted.model.ids
-    known = {frozenset(players): judgement.whole.held_out}
-    known[frozenset()] = judgement.ideal.held_out
+    known = {frozenset(players): assessment.whole.held_out}
+    known[frozenset()] = assessment.ideal.held_out
     # Models with the same first effects are adjacent, so that their common prediction is computed once.
     asked = sorted(list_subsets(players) - known.keys(), key=lambda one: [p in one for p in players])
     for one in asked:
-        known[one] = score(problem, fitted.state.drop([name for name in players if name not in one]))
-    stretches = _find_stretches(problem)
-    losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
+        known[one] = score(data, fitted.state.drop([name for name in players if name not in one]))
+    stretches = _find_stretches(data)
+    losses = {one: _sum_stretches(data, stretches, held, length_scale_m) for one, held in known.items()}
     split = share_out(players, losses)
-    floor = judgement.floor
+    floor = assessment.floor
     x, y, w = floor.velocity_rms
     floors = (x**2 + y**2 + (length_scale_m * w) ** 2, floor.t_mrmse_m**2, floor.r_mrmse_rad**2)
     return tuple(
-        _make_budget(problem.source.value, quantity, split, floors[column], column)
+        _make_budget(data.source.value, quantity, split, floors[column], column)
         for column, quantity in enumerate(QUANTITIES)
     )
 
@@ -130,28 +130,28 @@ def _list_orders(players: Sequence[str]) -> Iterator[tuple[str, ...]]:
         yield order[::-1]
 
 
-def _find_stretches(problem: Problem) -> Ints:
+def _find_stretches(data: EstimationData) -> Ints:
     """Ten-second stretch of each 2 s prediction, run by run, shape (m,)."""
-    whole = problem.whole
+    whole = data.whole
     middle = whole.times.mean(axis=1)
     units = []
-    for number, comparison in enumerate(problem.comparisons):
+    for number, run_residuals in enumerate(data.residuals_by_run):
         rows = whole.run == number
-        nearest = nearest_indices(comparison.horizons.times.mean(axis=1), middle[rows])
+        nearest = nearest_indices(run_residuals.horizons.times.mean(axis=1), middle[rows])
         units.append(whole.unit[rows][nearest])
     return np.concatenate(units)
 
 
-def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scale_m: float) -> Floats:
+def _sum_stretches(data: EstimationData, stretches: Ints, held: HeldOut, length_scale_m: float) -> Floats:
     """Contribution of each ten-second stretch to each mean square, shape (stretches, quantities).
 
     Args:
-        problem: the runs.
+        data: the runs.
         stretches: of the 2 s predictions, shape (m,).
         held: errors.
         length_scale_m: of the slip modulus [m].
     """
-    unit = problem.whole.unit
+    unit = data.whole.unit
     squares = np.sum((held.residuals * [1.0, 1.0, length_scale_m]) ** 2, axis=1)
     columns = [_add_up(unit, squares, unit)]
     columns += [_add_up(stretches, np.concatenate(errors) ** 2, unit) for errors in (held.position, held.yaw)]
@@ -213,15 +213,15 @@ def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     return ratio, student_quantile(0.95, count - 1) * error
 
 
-def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
+def find_moments(assessment: ModelAssessment) -> tuple[Moments, ...]:
     """When half of the squared held-out error of each run arises, where it is above the noise floor."""
-    moments, floor, reached = list[Moments](), judgement.floor, judgement.whole.held_out
+    moments, floor, reached = list[Moments](), assessment.floor, assessment.whole.held_out
     sides = (
         ("heading", reached.yaw, floor.r_mrmse_rad),
         ("position", reached.position, floor.t_mrmse_m),
     )
-    for number, comparison in enumerate(judgement.problem.comparisons):
-        stretch = np.floor(comparison.horizons.times.mean(axis=1) / HORIZON_S).astype(np.int64)
+    for number, run_residuals in enumerate(assessment.data.residuals_by_run):
+        stretch = np.floor(run_residuals.horizons.times.mean(axis=1) / HORIZON_S).astype(np.int64)
         for quantity, errors, least in sides:
             square = errors[number] ** 2
             known = np.isfinite(square)

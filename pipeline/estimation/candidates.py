@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from pipeline.estimation.fit import invert, whiten_columns
-from pipeline.estimation.state import stack_columns
+from pipeline.estimation.model_state import stack_columns
 from pipeline.models import Effect, Parameter, Search
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from pipeline.core import Floats
-    from pipeline.estimation.fit import PartFit
-    from pipeline.estimation.state import State
+    from pipeline.estimation.fit import PathFit
+    from pipeline.estimation.model_state import ModelState
     from pipeline.models import Largest
 
 PRICE = 25.0
@@ -102,7 +102,7 @@ class Trial:
         free = (name for name, value in self.effect.values.items() if math.isfinite(value))
         return len(set(free) - self.effect.fixed)
 
-    def add_to(self, state: State, step: Sequence[float]) -> State:
+    def add_to(self, state: ModelState, step: Sequence[float]) -> ModelState:
         """The state with the effect, its linear numbers moved by a step of the columns."""
         if self.own:
             delays = (np.clip(step, -1.0, 1.0) * self.own).tolist()
@@ -157,7 +157,7 @@ class Extension:
         """Expected gain less the price of its numbers."""
         return self.gain - PRICE * sum(trial.numbers for trial in self.trials)
 
-    def add_to(self, state: State) -> State:
+    def add_to(self, state: ModelState) -> ModelState:
         """The state with the effects at their expected values."""
         begin = 0
         for trial in self.trials:
@@ -176,7 +176,7 @@ class Screen:
         largest: reference of relative starts.
     """
 
-    def __init__(self, fit: PartFit, candidates: Sequence[Candidate], largest: Largest) -> None:
+    def __init__(self, fit: PathFit, candidates: Sequence[Candidate], largest: Largest) -> None:
         self.fit = fit
         trials = (
             trial
@@ -192,12 +192,12 @@ class Screen:
         self._columns = np.concatenate(columns, axis=2)
 
     @cached_property
-    def saturated(self) -> PartFit:
+    def saturated(self) -> PathFit:
         """The fit with the noise of what no candidate explains.
 
         The noise of present residuals takes a slow hidden effect for a slow disturbance, and hides it.
         """
-        fit, part = self.fit, self.fit.part
+        fit, path = self.fit, self.fit.path
         chosen = [*range(self._own), *self._list_best_columns(fit)]
         for _ in range(_PASSES if len(chosen) > self._own else 0):
             white = whiten_columns(fit, self._columns[:, :, chosen])
@@ -205,10 +205,10 @@ class Screen:
             normal = (white / size).T @ (white / size) + _SATURATED * np.eye(size.size)
             step = np.linalg.solve(normal, (white / size).T @ fit.white.residual) / size
             rest = fit.residual - self._columns[:, :, chosen] @ step
-            fit = replace(fit, noise=part.learn(rest, fit.noise))
+            fit = replace(fit, noise=path.learn(rest, fit.noise))
         return fit
 
-    def _list_best_columns(self, fit: PartFit) -> list[int]:
+    def _list_best_columns(self, fit: PathFit) -> list[int]:
         """Columns of the best start of each candidate."""
         normal, pull, _ = _project(fit, self._columns, self._own)
         best: dict[str, tuple[float, range]] = {}
@@ -286,7 +286,7 @@ class Screen:
         return Extension(trials, tuple(step.tolist()), float(step @ pull[at]) / variance)
 
 
-def _project(fit: PartFit, columns: Floats, own: int) -> tuple[Floats, Floats, Floats]:
+def _project(fit: PathFit, columns: Floats, own: int) -> tuple[Floats, Floats, Floats]:
     """Normal matrix and pull of candidates' columns, those of the model projected out, and squared sizes."""
     white = whiten_columns(fit, columns)
     mine, rest = white[:, :own], white[:, own:]
@@ -299,7 +299,7 @@ def _project(fit: PartFit, columns: Floats, own: int) -> tuple[Floats, Floats, F
     return rest.T @ rest, rest.T @ residual, sizes
 
 
-def _leave_out_silent(fit: PartFit, trial: Trial) -> Trial | None:
+def _leave_out_silent(fit: PathFit, trial: Trial) -> Trial | None:
     """The trial without numbers that have no influence; None if none has."""
     white = whiten_columns(fit, trial.columns)
     size = np.sqrt(np.einsum("ij,ij->j", white, white))
@@ -321,10 +321,10 @@ def _leave_out_silent(fit: PartFit, trial: Trial) -> Trial | None:
     return Trial(trial.effect.fix(*silent), names, trial.columns[:, :, keep])
 
 
-def list_trials(fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
+def list_trials(fit: PathFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
     """All starts of an effect with their columns."""
-    part = fit.part
-    if candidate.id in part.clocks:
+    path = fit.path
+    if candidate.id in path.clocks:
         yield _start_clocks(fit, candidate, largest)
         return
     starts = [candidate(**values) for values in list_starts(candidate, largest)]
@@ -337,24 +337,24 @@ def list_trials(fit: PartFit, candidate: Candidate, largest: Largest) -> Iterato
         for start in starts
     ]
     looked = [one for start, direct in zip(starts, changed, strict=True) for one in (start, *direct.values())]
-    part.look_ahead([fit.state.add(one) for one in looked if not one.is_neutral])
+    path.look_ahead([fit.state.add(one) for one in looked if not one.is_neutral])
     for start, direct in zip(starts, changed, strict=True):
         is_same = direct and start.is_neutral
-        base = fit.residual if is_same else part.find_residuals(fit.state.add(start))
+        base = fit.residual if is_same else path.find_residuals(fit.state.add(start))
         columns = [
-            (base - part.find_residuals(fit.state.add(one))) / start.parameter(name).step
+            (base - path.find_residuals(fit.state.add(one))) / start.parameter(name).step
             for name, one in direct.items()
         ]
         columns += [] if is_same else [fit.residual - base]
         yield Trial(start, tuple(direct), stack_columns(columns))
 
 
-def _start_clocks(fit: PartFit, candidate: Candidate, largest: Largest) -> Trial:
+def _start_clocks(fit: PathFit, candidate: Candidate, largest: Largest) -> Trial:
     """Each run's clock at the start whose secant promises most in that run."""
-    part, starts = fit.part, [candidate(**values) for values in list_starts(candidate, largest)]
-    shifts = [fit.residual - part.find_residuals(fit.state.add(start)) for start in starts]
+    path, starts = fit.path, [candidate(**values) for values in list_starts(candidate, largest)]
+    shifts = [fit.residual - path.find_residuals(fit.state.add(start)) for start in starts]
     white = whiten_columns(fit, stack_columns(shifts))
-    label = part.run[fit.white.rows]
+    label = path.run[fit.white.rows]
     pulls, sizes = (
         np.array([np.bincount(label, values) for values in (white * other).T])
         for other in (fit.white.residual[:, None], white)
@@ -362,7 +362,7 @@ def _start_clocks(fit: PartFit, candidate: Candidate, largest: Largest) -> Trial
     chosen = np.argmax(np.maximum(pulls, 0.0) ** 2 / np.maximum(sizes, 1e-12), axis=0)
     columns = np.zeros((*fit.residual.shape, chosen.size))
     for run, index in enumerate(chosen.tolist()):
-        rows = part.run == run
+        rows = path.run == run
         columns[rows, :, run] = shifts[index][rows]
     return Trial(starts[0], (), columns, tuple(starts[index].delay for index in chosen.tolist()))
 

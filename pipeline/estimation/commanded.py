@@ -27,7 +27,7 @@ from pipeline.core import (
     number_stretches,
     student_quantile,
 )
-from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import locate_windows
 from pipeline.models import Timing
 from pipeline.run import MotionRun
@@ -76,17 +76,17 @@ def measure_commanded_turn(run: MotionRun, vehicle: Vehicle) -> CommandedTurn | 
     if multiplier is None or run.commands is None or run.is_drive_alone:
         return None
     with contextlib.suppress(SlipError):
-        gained = _measure_gain(Comparison(run, vehicle, Input.COMMAND))
+        gained = _measure_gain(RunResiduals(run, vehicle, Input.COMMAND))
         if gained is not None and _LEAST_SHARE < multiplier * gained[0] < _MOST_SHARE:
             return CommandedTurn(multiplier * gained[0], gained[1], multiplier)
     return None
 
 
-def _measure_gain(comparison: Comparison) -> tuple[float, float] | None:
+def _measure_gain(run_residuals: RunResiduals) -> tuple[float, float] | None:
     """Yaw rate over that of the commanded wheels, and the standard deviation of its logarithm."""
-    times, asked = comparison.windows.times, comparison.predict_velocity((), Timing()).w
-    driven = [locate_windows(comparison, late).average(comparison, asked) for late in _DELAYS_S]
-    windows = comparison.find_residuals((), Timing())[:, 2] + driven[0]
+    times, asked = run_residuals.windows.times, run_residuals.predict_velocity((), Timing()).w
+    driven = [locate_windows(run_residuals, late).average(run_residuals, asked) for late in _DELAYS_S]
+    windows = run_residuals.find_residuals((), Timing())[:, 2] + driven[0]
     inner = np.arange(_ASIDE, max(windows.size - _ASIDE, _ASIDE))
     apart = times[inner + _ASIDE, 0] - times[inner - _ASIDE, 0]
     near = (apart > 0.0) & (apart < _LONGEST_S)

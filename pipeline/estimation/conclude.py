@@ -20,7 +20,6 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.apportion import apportion, find_moments
 from pipeline.estimation.commanded import measure_commanded_turn
-from pipeline.estimation.comparison import Input
 from pipeline.estimation.constancy import find_change
 from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.driving_need import Curve, measure_need, narrow_intervals, thin_growth
@@ -33,9 +32,10 @@ from pipeline.estimation.estimates import (
     note_cut,
     was_aligned,
 )
-from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, list_order, note_fit
+from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, list_order, note_fit
 from pipeline.estimation.learned_step import learn_beyond, summarize_learned
 from pipeline.estimation.plausibility import measure_moves
+from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
 from pipeline.results import (
     Delays,
@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.decision import Judged, Search, SearchResult
+    from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.learned_step import LearnedStep
-    from pipeline.estimation.problem import Problem
     from pipeline.estimation.recordings import Recording
     from pipeline.models import FormulaEffect
 
@@ -66,7 +66,7 @@ _CLOCKS = frozenset({Late.POSES, Late.HEADING})
 
 
 @dataclass(frozen=True)
-class Explored:
+class PathResult:
     """Results of the search on one path.
 
     Attributes:
@@ -103,7 +103,7 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
 
 
 def summarize(
-    problem: Problem, source: Input, results: Sequence[Explored], clocks: Clocks, length_scale_m: float
+    data: EstimationData, source: Input, results: Sequence[PathResult], clocks: Clocks, length_scale_m: float
 ) -> tuple[Diagnosis, Sequence[Delays]]:
     """The common diagnosis of runs that were judged together.
 
@@ -111,46 +111,46 @@ def summarize(
         It as the only run of a diagnosis, and the delays of each run.
     """
     body = results[0]
-    taken = _gather(results, clocks, problem)
+    taken = _gather(results, clocks, data)
     known = frozenset().union(*(result.search.given for result in results))
     undecided = [*(item for result in results for item in result.undecided), *clocks.undecided]
     inputs = tuple(dict.fromkeys((source, Input(body.name))))
-    judgements = _judge_ways(problem, inputs, Model(problem.vehicle, tuple(taken)))
-    judgement = judgements.get(source.value)
+    assessments = _assess_paths(data, inputs, Model(data.vehicle, tuple(taken)))
+    assessment = assessments.get(source.value)
     open_ids = {item.candidates[0] for item in undecided}
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
-    widths = {} if judgement is None else narrow_intervals(judgement.fitted)
-    named = _order(tuple(_name(one, problem, results, judgement, widths) for one in added), judgement)
-    if judgement is not None:
-        undecided = take_judged(undecided, judgement)
+    widths = {} if assessment is None else narrow_intervals(assessment.fitted)
+    named = _order(tuple(_name(one, data, results, assessment, widths) for one in added), assessment)
+    if assessment is not None:
+        undecided = take_judged(undecided, assessment)
     # What the wheels leave is a matter of the ground, wherever the model starts.
-    ground = judgements.get(body.name, judgement)
+    ground = assessments.get(body.name, assessment)
     suggestion = None
     if ground is not None and body.formula is not None:
-        suggestion = residual_structure.suggest(ground, body.formula, judgement or ground)
+        suggestion = residual_structure.suggest(ground, body.formula, assessment or ground)
     if ground is not None and suggestion is not None:
         # What a formula leaves is nearer to what nothing explains.
-        own = body.name if body.name in judgements else source.value
-        ground = judgements[own] = dataclasses.replace(ground, suggested=suggestion.ground)
-        if judgement is not None:
-            judgement = dataclasses.replace(judgement, suggested=suggestion.leading)
-            judgements[source.value] = judgement
+        own = body.name if body.name in assessments else source.value
+        ground = assessments[own] = dataclasses.replace(ground, suggested=suggestion.ground)
+        if assessment is not None:
+            assessment = dataclasses.replace(assessment, suggested=suggestion.leading)
+            assessments[source.value] = assessment
     learned = None if ground is None else learn_beyond(ground)
-    region = _find_region(problem, judgement)
-    windows, start = problem.whole, body.outcome.start.state
+    region = _find_region(data, assessment)
+    windows, start = data.whole, body.outcome.start.state
     residual = windows.find_residuals(start)
     regions = map_errors(windows, residual, windows.find_places())
     hidden = {name for item in undecided for name in item.candidates}.union(
         *({effect.id, *effect.searched_as, *effect.contains} for effect in taken)
     )
     unobservable = {n: one for result in results for n, one in result.unobservable.items() if n not in hidden}
-    last = None if judgement is None else judgement.ladder.explained_shares(judgement.floor)[-1]
-    proposal = None if judgement is None else note_fit(_begin(judgement, undecided), judgement)
+    last = None if assessment is None else assessment.ladder.explained_shares(assessment.floor)[-1]
+    proposal = None if assessment is None else note_fit(_begin(assessment, undecided), assessment)
     ids = () if proposal is None else proposal.model.ids
     common = RunDiagnosis(
         input=source.value,
-        joint=tuple(run.name for run in problem.runs),
-        vehicle=problem.vehicle,
+        joint=tuple(run.name for run in data.runs),
+        vehicle=data.vehicle,
         effects=named,
         undecided=tuple(
             replace(item, in_model=next((name for name in item.candidates if name in ids), None))
@@ -163,32 +163,32 @@ def summarize(
         else suggestion.unexplained,
         findings=(
             *note_cut(body.search.budget),
-            *(() if judgement is None else find_change(judgement)),
+            *(() if assessment is None else find_change(assessment)),
         ),
-        ladder=() if judgement is None else _list_steps(judgement),
-        noise_floor=None if judgement is None else read_result(errors_as_json(judgement.floor), Errors),
+        ladder=() if assessment is None else _list_steps(assessment),
+        noise_floor=None if assessment is None else read_result(errors_as_json(assessment.floor), Errors),
         explained_share=math.nan if last is None else last,
         learned=None
         if learned is None or ground is None
         else summarize_learned(learned, ground.ideal.errors, ground.floor),
         where=tuple(pick_regions(regions, residual, windows.noise)),
-        when=() if judgement is None else find_moments(judgement),
-        by_path=_summarize_paths(results, source, judgements.get("measured")),
+        when=() if assessment is None else find_moments(assessment),
+        by_path=_summarize_paths(results, source, assessments.get("measured")),
         disturbance=residual_structure.summarize_disturbance(body.outcome.final),
         concentrated=region,
         model=None if proposal is None else format_model(proposal),
         budget=tuple(
-            budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
+            budget for one in assessments.values() for budget in apportion(one, length_scale_m=length_scale_m)
         ),
         need=measure_need(named, widths),
     )
-    estimates = tuple(number for one in judgements.values() for number in list_estimates(problem, one, named))
-    fitted = judgement.fitted if judgement else None
+    estimates = tuple(number for one in assessments.values() for number in list_estimates(data, one, named))
+    fitted = assessment.fitted if assessment else None
     return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
 
 
 def _find_unexplained(
-    results: Sequence[Explored], learned: LearnedStep | None, region: Region | None
+    results: Sequence[PathResult], learned: LearnedStep | None, region: Region | None
 ) -> Unexplained | None:
     """What no effect and no formula explains: a learned term, what lasts, or where nearly all of it is."""
     if learned is not None:
@@ -204,22 +204,22 @@ def _find_unexplained(
     return outcome
 
 
-def _find_region(problem: Problem, judgement: Judgement | None) -> Region | None:
+def _find_region(data: EstimationData, assessment: ModelAssessment | None) -> Region | None:
     """The region with most of the remaining error; None where it is spread evenly."""
-    if judgement is None:
+    if assessment is None:
         return None
-    windows, residual = problem.whole, judgement.whole.held_out.residuals
+    windows, residual = data.whole, assessment.whole.held_out.residuals
     known = np.where(np.isfinite(residual), residual, 0.0)
     return find_main_region(windows, known, windows.find_places())
 
 
-def _begin(judgement: Judgement, undecided: Sequence[Undecided]) -> ModelFile:
+def _begin(assessment: ModelAssessment, undecided: Sequence[Undecided]) -> ModelFile:
     groups = [list(item.candidates) for item in undecided]
-    return ModelFile(judgement.fitted.model, fit={"undecided": groups})
+    return ModelFile(assessment.fitted.model, fit={"undecided": groups})
 
 
 def of_run(
-    common: RunDiagnosis, recording: Recording, number: int, delays: Delays, problem: Problem
+    common: RunDiagnosis, recording: Recording, number: int, delays: Delays, data: EstimationData
 ) -> RunDiagnosis:
     """The common diagnosis with the name, findings and delays of one run."""
     effects = tuple(
@@ -228,19 +228,19 @@ def of_run(
     for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
         (late,) = clock.parameters.values()
         delays = replace(delays, pose_delay_s=round(late.value, 4))
-    turn = measure_commanded_turn(problem.runs[number], problem.vehicle)
+    turn = measure_commanded_turn(data.runs[number], data.vehicle)
     return replace(
         common,
         run=recording.name,
         effects=effects,
-        findings=(*common.findings, *note_brevity(problem, common), *recording.list_findings()),
+        findings=(*common.findings, *note_brevity(data, common), *recording.list_findings()),
         timing=delays,
         when=tuple(one for one in common.when if one.run == number),
         commanded_turn=None if turn is None else turn.as_result(),
     )
 
 
-def _gather(results: Sequence[Explored], clocks: Clocks, problem: Problem) -> list[Effect]:
+def _gather(results: Sequence[PathResult], clocks: Clocks, data: EstimationData) -> list[Effect]:
     """All identified effects, with clock effects and composite effects under their own ids."""
     effects = {
         effect.id: effect
@@ -249,51 +249,49 @@ def _gather(results: Sequence[Explored], clocks: Clocks, problem: Problem) -> li
         if effect.late is not Late.POSES and effect.id in (*result.outcome.new, *result.outcome.start.ids)
     }
     effects |= {effect.id: effect for effect in clocks.effects}
-    joined = join_classes(list(effects.values()), problem.vehicle)
+    joined = join_classes(list(effects.values()), data.vehicle)
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 
-def _judge_ways(problem: Problem, inputs: Sequence[Input], model: Model) -> dict[str, Judgement]:
+def _assess_paths(data: EstimationData, inputs: Sequence[Input], model: Model) -> dict[str, ModelAssessment]:
     """The model of these effects judged from each input to the body."""
-    # In sequence, so that the ground part of the model is fitted once for both.
-    judged = {source.value: _judge_path(problem, model, source) for source in inputs}
+    # In sequence, so that the ground path of the model is fitted once for both.
+    judged = {source.value: _assess_path(data, model, source) for source in inputs}
     return {name: one for name, one in judged.items() if one is not None}
 
 
-def _find_problem(problem: Problem, source: Input) -> Problem:
-    return problem if source is problem.source else problem.behind_wheels
+def _choose_data(data: EstimationData, source: Input) -> EstimationData:
+    return data if source is data.source else data.behind_wheels
 
 
-def _judge_path(problem: Problem, model: Model, source: Input) -> Judgement | None:
+def _assess_path(data: EstimationData, model: Model, source: Input) -> ModelAssessment | None:
     """The model judged from one input to the body; None where that is not possible."""
     with contextlib.suppress(MotionError):
-        return judge_model(_find_problem(problem, source), model)
+        return assess_model(_choose_data(data, source), model)
     return None
 
 
 def _name(
     effect: Effect,
-    problem: Problem,
-    results: Sequence[Explored],
-    judgement: Judgement | None,
+    data: EstimationData,
+    results: Sequence[PathResult],
+    assessment: ModelAssessment | None,
     widths: Mapping[str, Curve],
 ) -> Named:
     result = next((one for one in results if one.judge(effect) is not None), results[0])
     judged = result.judge(effect)
-    by_run = list_by_run(effect, problem, judgement)
+    by_run = list_by_run(effect, data, assessment)
     values = by_run[0]
     return Named(
         id=effect.id,
         parameters=values,
         gain=math.nan if judged is None else judged.gain / max(1.0 - judged.gain, 1e-12),
-        equivalent_to=list_equivalents(effect, problem),
-        confused_with=tuple(
-            dict.fromkeys((*effect.confused_with, *_list_trading(effect, problem, judgement)))
-        ),
-        corrected=was_aligned(effect, problem),
+        equivalent_to=list_equivalents(effect, data),
+        confused_with=tuple(dict.fromkeys((*effect.confused_with, *_list_trading(effect, data, assessment)))),
+        corrected=was_aligned(effect, data),
         path=result.name,
         selection_frequency=math.nan if judged is None else judged.frequency,
-        moves=None if judgement is None else measure_moves(judgement.fitted, effect),
+        moves=None if assessment is None else measure_moves(assessment.fitted, effect),
         growth=thin_growth(
             None if judged is None else _grow_evidence(result, judged),
             {name: widths[label] for name in values if (label := f"{effect.id}.{name}") in widths},
@@ -302,22 +300,22 @@ def _name(
     )
 
 
-def _grow_evidence(result: Explored, judged: Judged) -> Curve:
+def _grow_evidence(result: PathResult, judged: Judged) -> Curve:
     """Evidence for an effect in standard errors by the seconds of driving."""
-    part = result.search.part
-    seconds = np.cumsum(np.bincount(part.unit, part.spans, minlength=judged.evidence.size))
+    path = result.search.path
+    seconds = np.cumsum(np.bincount(path.unit, path.spans, minlength=judged.evidence.size))
     return Curve(np.asarray(seconds, dtype=np.float64), np.sqrt(np.maximum(np.cumsum(judged.evidence), 0.0)))
 
 
-def _list_trading(effect: Effect, problem: Problem, judgement: Judgement | None) -> list[str]:
+def _list_trading(effect: Effect, data: EstimationData, assessment: ModelAssessment | None) -> list[str]:
     """Ids of effects whose estimate is correlated with a clock, or of clocks correlated with an effect."""
-    if judgement is None:
+    if assessment is None:
         return []
-    estimates, model = judgement.estimates, judgement.fitted.model
+    estimates, model = assessment.estimates, assessment.fitted.model
     clocks = {one.id for one in model if one.late in _CLOCKS}
     pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
     pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
-    if problem.has_gyro:
+    if data.has_gyro:
         # A clock that was corrected beforehand is not a parameter of the fit.
         aligned = find_late_effect(Late.POSES).id
         clocks.add(aligned)
@@ -326,18 +324,18 @@ def _list_trading(effect: Effect, problem: Problem, judgement: Judgement | None)
     return sorted(set().union(*pairs) - {effect.id})
 
 
-def _order(named: tuple[Named, ...], judgement: Judgement | None) -> tuple[Named, ...]:
+def _order(named: tuple[Named, ...], assessment: ModelAssessment | None) -> tuple[Named, ...]:
     """Named effects in the order of the ladder, those without a step last."""
-    ranked = [] if judgement is None else list_order(judgement.ladder.steps)
+    ranked = [] if assessment is None else list_order(assessment.ladder.steps)
     return tuple(sorted(named, key=lambda one: [*ranked, one.id].index(one.id)))
 
 
-def _list_steps(judgement: Judgement) -> tuple[Step, ...]:
-    return tuple(read_result(one, Step) for one in ladder_as_json(judgement.ladder, judgement.floor))
+def _list_steps(assessment: ModelAssessment) -> tuple[Step, ...]:
+    return tuple(read_result(one, Step) for one in ladder_as_json(assessment.ladder, assessment.floor))
 
 
 def _summarize_paths(
-    results: Sequence[Explored], source: Input, measured: Judgement | None
+    results: Sequence[PathResult], source: Input, measured: ModelAssessment | None
 ) -> dict[str, PathLadder]:
     """Separate ladders of the ground and of the drivetrain."""
     if len(results) == 1:
@@ -347,7 +345,7 @@ def _summarize_paths(
     if source is Input.COMMAND and measured is not None:
         floor = read_result(errors_as_json(measured.floor), Errors)
         described["measured"] = PathLadder(measured.fitted.model.ids, _list_steps(measured), floor)
-    spans = wheels.final.part.spans[:, None]
+    spans = wheels.final.path.spans[:, None]
     steps = tuple(
         Step(
             velocity_rms=tuple(np.sqrt(((one.residual / spans) ** 2).mean(axis=0)).tolist()),

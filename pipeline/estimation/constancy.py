@@ -26,12 +26,12 @@ from pipeline.results import CHANGE, ERRORS_OVER_2S, Finding
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from pipeline.estimation.comparison import Comparison
-    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.fit import PathFit
     from pipeline.estimation.held_out import HeldOut
-    from pipeline.estimation.ladder import Judgement
-    from pipeline.estimation.parts import Part
-    from pipeline.estimation.state import Free, State
+    from pipeline.estimation.ladder import ModelAssessment
+    from pipeline.estimation.model_state import Free, ModelState
+    from pipeline.estimation.path_residuals import PathResiduals
+    from pipeline.estimation.run_residuals import RunResiduals
 
 _MARGIN = 2
 """Blocks at either end within which no change is looked for: one block alone has no spread."""
@@ -47,19 +47,19 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class _Change:
-    """The most significant change of a number of a part of the path.
+    """The most significant change of a number of a path.
 
     Attributes:
-        index: of the part among those of the problem.
-        part, fit: the part and its fit.
+        index: of the path among those of the data.
+        path, fit: the path and its fit.
         number: the number.
         time: end of the last block before the change [s].
         t: the change over its standard error.
     """
 
     index: int
-    part: Part
-    fit: PartFit
+    path: PathResiduals
+    fit: PathFit
     number: Free
     time: float
     t: float
@@ -67,10 +67,10 @@ class _Change:
     @property
     def sides(self) -> tuple[Flags, Flags]:
         """Windows before the change, and those after it."""
-        early: Flags = self.part.times[:, 1] <= self.time
+        early: Flags = self.path.times[:, 1] <= self.time
         return early, ~early
 
-    def fit_sides(self, starts: Sequence[PartFit], rounds: int) -> list[PartFit]:
+    def fit_sides(self, starts: Sequence[PathFit], rounds: int) -> list[PathFit]:
         """Fits to the windows on either side, with residuals and derivatives of all windows.
 
         Args:
@@ -84,56 +84,56 @@ class _Change:
                 state = refit(fit, side)
                 if state is fit.state:
                     break
-                residual = self.part.find_residuals(state)
-                columns = self.part.differentiate(state, residual, fit.free)
+                residual = self.path.find_residuals(state)
+                columns = self.path.differentiate(state, residual, fit.free)
                 fit = replace(fit, state=state, residual=residual, columns=columns)
             fits.append(fit)
         return fits
 
-    def locate(self, fits: Sequence[PartFit]) -> _Change:
+    def locate(self, fits: Sequence[PathFit]) -> _Change:
         """The change at the time at which both fits together are best: blocks are several seconds long."""
-        before, after = (list_costs(self.part, self.fit.noise, fit.residual) for fit in fits)
+        before, after = (list_costs(self.path, self.fit.noise, fit.residual) for fit in fits)
         first = int(np.argmin(np.cumsum(before - after)))
-        return replace(self, time=float(self.part.times[first, 1]))
+        return replace(self, time=float(self.path.times[first, 1]))
 
 
-def find_change(judgement: Judgement) -> list[Finding]:
+def find_change(assessment: ModelAssessment) -> list[Finding]:
     """A finding about the most significant change of a number during a run; empty without a change.
 
     Of several runs that were fitted together none is examined: they differ from one another.
     """
-    problem, fitted = judgement.problem, judgement.fitted
-    if len(problem.comparisons) > 1:
+    data, fitted = assessment.data, assessment.fitted
+    if len(data.residuals_by_run) > 1:
         return []
-    parts = enumerate(zip(problem.parts, fitted.fits, strict=True))
-    changes = [one for index, (part, fit) in parts if fit.free for one in _list_changes(index, part, fit)]
+    paths = enumerate(zip(data.paths, fitted.fits, strict=True))
+    changes = [one for index, (path, fit) in paths if fit.free for one in _list_changes(index, path, fit)]
     if not changes:
         return []
     changes.sort(key=lambda one: -abs(one.t))
-    one_value = score(problem, fitted.state)
-    (comparison,), examined = problem.comparisons, set[tuple[int, float]]()
-    everywhere = np.ones(comparison.horizons.number.size, dtype=np.bool_)
+    one_value = score(data, fitted.state)
+    (run_residuals,), examined = data.residuals_by_run, set[tuple[int, float]]()
+    everywhere = np.ones(run_residuals.horizons.number.size, dtype=np.bool_)
     for rough in changes:
         nearly = rough.fit_sides([rough.fit] * 2, 1)
         change = rough.locate(nearly)
-        # All numbers of a part are fitted: of two that change at one time the second is the same question.
+        # All numbers of a path are fitted: of two that change at one time the second is the same question.
         if (change.index, change.time) in examined:
             continue
         examined.add((change.index, change.time))
         fits = change.fit_sides(nearly, _ROUNDS)
         whole = [fitted.state.take_over(fit.state, fit.free) for fit in fits]
-        if not _is_lower(_predict(comparison, change, [(whole, everywhere)]), one_value):
+        if not _is_lower(_predict(run_residuals, change, [(whole, everywhere)]), one_value):
             continue
         folds = []
-        for number, (fold, training) in enumerate(zip(problem.folds, problem.training, strict=True)):
-            state, rows = refit_fold(problem, fitted, number), training[change.index]
+        for number, (fold, training) in enumerate(zip(data.folds, data.training, strict=True)):
+            state, rows = refit_fold(data, fitted, number), training[change.index]
             sides = zip(fits, change.sides, strict=True)
             models = [state.take_over(refit(fit, rows & side), fit.free) for fit, side in sides]
-            folds.append((models, find_in_test(comparison, problem.whole.times, fold.test)))
-        errors = _predict(comparison, change, folds)
-        if _is_lower(errors, judgement.whole.held_out):
+            folds.append((models, find_in_test(run_residuals, data.whole.times, fold.test)))
+        errors = _predict(run_residuals, change, folds)
+        if _is_lower(errors, assessment.whole.held_out):
             others = [one.number.effect for one in changes if one.number.effect != change.number.effect]
-            since = change.time - problem.comparisons[0].run.start_s
+            since = change.time - data.residuals_by_run[0].run.start_s
             return [
                 _report([fit.state for fit in fits], change.number, since, errors, [*dict.fromkeys(others)])
             ]
@@ -141,7 +141,11 @@ def find_change(judgement: Judgement) -> list[Finding]:
 
 
 def _report(
-    sides: Sequence[State], number: Free, since: float, errors: Mapping[str, float], others: Sequence[str]
+    sides: Sequence[ModelState],
+    number: Free,
+    since: float,
+    errors: Mapping[str, float],
+    others: Sequence[str],
 ) -> Finding:
     """The finding of a change.
 
@@ -176,27 +180,27 @@ def _is_lower(errors: Mapping[str, float], than: HeldOut) -> bool:
 
 
 def _predict(
-    comparison: Comparison, change: _Change, judged: Sequence[tuple[Sequence[State], Flags]]
+    run_residuals: RunResiduals, change: _Change, judged: Sequence[tuple[Sequence[ModelState], Flags]]
 ) -> dict[str, float]:
     """Errors over 2 s with the models before and after a change, by their names in `Errors`.
 
     Args:
-        comparison: the run.
+        run_residuals: the run.
         change: the change.
         judged: pairs of both models and a mask of the predictions that judge them.
     """
-    early = comparison.horizons.times.mean(axis=1) < change.time
+    early = run_residuals.horizons.times.mean(axis=1) < change.time
     squares = np.full((2, early.size), np.nan)
     for models, near in judged:
         for state, rows in zip(models, (near & early, near & ~early), strict=True):
-            errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
+            errors = run_residuals.find_horizon_errors(state.effects_of(0), state.timing[0])
             squares[:, rows] = np.array((errors.position, errors.yaw))[:, rows] ** 2
     return dict(zip(ERRORS_OVER_2S, np.sqrt(np.nanmean(squares, axis=1)).tolist(), strict=True))
 
 
-def _list_changes(index: int, part: Part, fit: PartFit) -> Iterator[_Change]:
+def _list_changes(index: int, path: PathResiduals, fit: PathFit) -> Iterator[_Change]:
     """The most significant change of every number of the effects, where it is significant."""
-    white, label, count = fit.white, part.unit, int(part.unit.max()) + 1
+    white, label, count = fit.white, path.unit, int(path.unit.max()) + 1
     of_row = label[white.rows]
     size = np.linalg.norm(white.columns, axis=0) + 1e-100
     columns = white.columns / size
@@ -210,8 +214,8 @@ def _list_changes(index: int, part: Part, fit: PartFit) -> Iterator[_Change]:
         statistics = _compare_sides(normals, pulls, column)[_MARGIN - 1 : count - _MARGIN]
         best = int(np.abs(statistics).argmax()) if statistics.size else 0
         if statistics.size and abs(statistics[best]) > LEAST_T:
-            time = float(part.times[label <= best + _MARGIN - 1, 1].max())
-            yield _Change(index, part, fit, number, time, float(statistics[best]))
+            time = float(path.times[label <= best + _MARGIN - 1, 1].max())
+            yield _Change(index, path, fit, number, time, float(statistics[best]))
 
 
 def _compare_sides(normals: Floats, pulls: Floats, index: int) -> Floats:

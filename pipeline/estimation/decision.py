@@ -17,19 +17,19 @@ from scipy.special import stdtr
 
 from pipeline.core import NORMAL_95, Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, Screen, list_starts
-from pipeline.estimation.fit import PartFit, approach, fit_part
+from pipeline.estimation.fit import PathFit, approach, fit_path
 from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.noise import huber_cost
-from pipeline.estimation.parts import HORIZONS_S
+from pipeline.estimation.path_residuals import HORIZONS_S
 from pipeline.estimation.plausibility import is_nameable, is_too_small, list_implausible
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from pipeline.core import Floats, Ints
+    from pipeline.estimation.model_state import ModelState
     from pipeline.estimation.noise import Noise
-    from pipeline.estimation.parts import HorizonError, Part
-    from pipeline.estimation.state import State
+    from pipeline.estimation.path_residuals import HorizonError, PathResiduals
     from pipeline.models import Conditions, Effect
 
 LEAST_T = 5.0
@@ -87,8 +87,8 @@ class Judged:
             (4, 2), NaN where nothing is predicted so far.
     """
 
-    base: PartFit
-    fit: PartFit
+    base: PathFit
+    fit: PathFit
     added: tuple[str, ...]
     refusal: str
     gain: float = math.nan
@@ -102,12 +102,12 @@ class Judged:
         return find_cost(self.fit)
 
 
-def find_cost(fit: PartFit) -> float:
+def find_cost(fit: PathFit) -> float:
     """Minus twice the log-likelihood of a fit, with the price of its numbers and of unusual effects."""
     return fit.score + _find_price(fit.state, fit.numbers)
 
 
-def _find_price(state: State, numbers: int) -> float:
+def _find_price(state: ModelState, numbers: int) -> float:
     """What a model must bring for its numbers and unusual effects."""
     unusual = sum(not any(p.quantities for p in effect.parameters) for effect in state.effects)
     return PRICE * numbers + _UNUSUAL * unusual
@@ -130,7 +130,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The result of a search on one part of the path.
+    """The result of a search on one path.
 
     Attributes:
         start: the model to start from, fitted.
@@ -141,8 +141,8 @@ class SearchResult:
         screen: what candidates explain of its residuals.
     """
 
-    start: PartFit
-    final: PartFit
+    start: PathFit
+    final: PathFit
     new: tuple[str, ...]
     judged: dict[str, Judged]
     rivals: tuple[Rival, ...]
@@ -151,10 +151,10 @@ class SearchResult:
 
 @dataclass
 class Search:
-    """A search on one part of the path.
+    """A search on one path.
 
     Attributes:
-        part: the part.
+        path: the path.
         candidates: effects that may be named.
         conditions: what the runs can show.
         given: ids of effects that stay.
@@ -162,16 +162,16 @@ class Search:
         shapes: of how many shapes each candidate is the best one: the evidence for it is reduced accordingly.
     """
 
-    part: Part
+    path: PathResiduals
     candidates: tuple[Candidate, ...]
     conditions: Conditions
     given: frozenset[str] = frozenset()
     budget: Budget = field(default_factory=Budget)
     shapes: int = 1
-    _fits: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
+    _fits: dict[tuple[object, ...], PathFit] = field(default_factory=dict)
     _rivals: dict[tuple[object, ...], list[Judged]] = field(default_factory=dict, init=False)
 
-    def run(self, start: State) -> SearchResult:
+    def run(self, start: ModelState) -> SearchResult:
         """Search from a model."""
         first, asked = self.fit(start), self.given
         extended = self._extend_all(first)
@@ -188,7 +188,7 @@ class Search:
             result, other = self._conclude(first, extended)
         return result
 
-    def _conclude(self, first: PartFit, extended: PartFit) -> tuple[SearchResult, PartFit | None]:
+    def _conclude(self, first: PathFit, extended: PathFit) -> tuple[SearchResult, PathFit | None]:
         """The result with a model's accepted effects, and a better model with others in the place of one."""
         current, judged = self._restore(*self.refuse(extended), extended)
         rivals, better = list[Rival](), list[Judged]()
@@ -205,10 +205,10 @@ class Search:
         chosen = _choose(better)
         return result, None if chosen is None else self.prune(chosen.fit)
 
-    def _extend_all(self, current: PartFit) -> PartFit:
+    def _extend_all(self, current: PathFit) -> PathFit:
         """The model extended until nothing is accepted."""
         while not self.budget.is_spent():
-            self.budget.report(self.part.title, current.ids)
+            self.budget.report(self.path.title, current.ids)
             known = current.ids
             fine = [one for one in self._extend(current) if self._is_fine(one)]
             small = _choose([one for one in fine if self._list_small(one.fit, known)])
@@ -231,7 +231,7 @@ class Search:
             current = better
         return current
 
-    def _exchange(self, current: PartFit) -> PartFit | None:
+    def _exchange(self, current: PathFit) -> PathFit | None:
         """A better model with others in the place of one effect, or with an effect for its special cases."""
         companions = {name for effect in current.state.effects for name in effect.companions}
         for candidate in self.candidates:
@@ -249,7 +249,7 @@ class Search:
                 return self.prune(best.fit)
         return None
 
-    def _is_better(self, other: Judged, current: PartFit) -> bool:
+    def _is_better(self, other: Judged, current: PathFit) -> bool:
         """Whether a model is accepted, more likely than another one, and raises no error beyond chance."""
         if other.refusal or other.cost >= find_cost(current) - EQUAL:
             return False
@@ -260,7 +260,7 @@ class Search:
     def _least_t(self) -> float:
         return math.sqrt(LEAST_T**2 + 2.0 * math.log(self.shapes))
 
-    def _judge(self, base: PartFit, fit: PartFit, *, is_final: bool) -> Judged:
+    def _judge(self, base: PathFit, fit: PathFit, *, is_final: bool) -> Judged:
         small = self._list_small(fit, base.ids)
         named = set(fit.ids) - set(base.ids) - {one.id for one in small}
         if small and named:
@@ -270,7 +270,7 @@ class Search:
             base = self.fit(fit.state.drop(named).add(*held))
         return judge(base, fit, self.conditions, self._least_t, is_final=is_final)
 
-    def _list_small(self, fit: PartFit, known: Collection[str] = ()) -> list[Effect]:
+    def _list_small(self, fit: PathFit, known: Collection[str] = ()) -> list[Effect]:
         """Effects of a model, but for the known ones, that only their size keeps from a name."""
         new = (effect for effect in fit.state.effects if effect.id not in known)
         return [
@@ -282,27 +282,27 @@ class Search:
         small = self._list_small(judged.fit, judged.base.ids)
         return not judged.refusal or (bool(small) and len(small) == len(judged.added))
 
-    def fit(self, state: State, most: float = math.inf, noise: Noise | None = None) -> PartFit:
+    def fit(self, state: ModelState, most: float = math.inf, noise: Noise | None = None) -> PathFit:
         """The fit from a state; made once, unless it ended early as it cannot cost less than `most`."""
         key = _make_key(state)
         if key in self._fits:
             return self._fits[key]
-        target = most - _find_price(state, len(self.part.list_free(state)))
-        fit = fit_part(self.part, state, noise=noise, target=target)
+        target = most - _find_price(state, len(self.path.list_free(state)))
+        fit = fit_path(self.path, state, noise=noise, target=target)
         if find_cost(fit) < most:
             self._fits[key] = fit
         return fit
 
-    def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:
+    def _drop(self, fit: PathFit, names: Collection[str]) -> PathFit:
         return self.fit(fit.state.drop(names))
 
-    def screen(self, fit: PartFit, without: Collection[str] = ()) -> Screen:
+    def screen(self, fit: PathFit, without: Collection[str] = ()) -> Screen:
         """What could be added to a model; special cases of its effects are in it already."""
         known = set(without).union(*({*effect.contains} for effect in fit.state.effects))
         acting = [one for one in self.candidates if one.id not in known and one().acts_in(fit.ids)]
         return Screen(fit, acting, self.conditions.largest)
 
-    def _extend(self, current: PartFit) -> list[Judged]:
+    def _extend(self, current: PathFit) -> list[Judged]:
         """Extensions of a model, accepted or refused."""
         if len(current.ids) - len(self.given) >= _MOST_EFFECTS:
             return []
@@ -310,7 +310,7 @@ class Search:
 
     def _judge_extensions(
         self,
-        base: PartFit,
+        base: PathFit,
         screen: Screen,
         singles: int,
         pairs: int,
@@ -327,7 +327,7 @@ class Search:
             wanted: expected gain, less price, that they must exceed.
             reached: cost of the model that they would replace.
         """
-        judged, before, rough = dict[tuple[str, ...], Judged](), find_cost(base), list[PartFit]()
+        judged, before, rough = dict[tuple[str, ...], Judged](), find_cost(base), list[PathFit]()
         most, reached = min(before, reached + EQUAL), min(before, reached)
         for extensions, places in ((screen.list_singles(), singles), (screen.list_pairs(), pairs)):
             # Some steps show which may come near the best, and which keep nothing of what they promise.
@@ -350,7 +350,7 @@ class Search:
                 reached = min(reached, one.cost)
         return list(judged.values())
 
-    def _reduce(self, fit: PartFit, base: PartFit) -> PartFit:
+    def _reduce(self, fit: PathFit, base: PathFit) -> PathFit:
         """The fit with the simpler form of a new effect that has become one, and without idle old ones."""
         for effect in fit.state.effects:
             if effect.id in self.given or is_nameable(effect, self.conditions):
@@ -371,7 +371,7 @@ class Search:
                 return self._reduce(self._drop(fit, [effect.id]), base)
         return fit
 
-    def prune(self, fit: PartFit) -> PartFit:
+    def prune(self, fit: PathFit) -> PathFit:
         """The model without effects that its others have made superfluous, the least evident first."""
         while True:
             free = [effect for effect in fit.state.effects if effect.id not in self.given]
@@ -380,7 +380,7 @@ class Search:
                 return fit
             fit = self._drop(fit, [min(weak)[1]])
 
-    def refuse(self, fit: PartFit) -> tuple[PartFit, dict[str, Judged]]:
+    def refuse(self, fit: PathFit) -> tuple[PathFit, dict[str, Judged]]:
         """The model without effects that are not accepted beside its others, and how each was judged.
 
         Effects whose numbers are correlated are judged together, too: one may only undo what the other does.
@@ -405,8 +405,8 @@ class Search:
                 refused = [one for names in others if (one := self._judge_last(fit, names)).refusal]
 
     def _restore(
-        self, fit: PartFit, judged: dict[str, Judged], extended: PartFit
-    ) -> tuple[PartFit, dict[str, Judged]]:
+        self, fit: PathFit, judged: dict[str, Judged], extended: PathFit
+    ) -> tuple[PathFit, dict[str, Judged]]:
         """The model with what was refused beside effects that went after it, and is accepted without them."""
         gone = [effect for effect in extended.state.effects if effect.id not in fit.ids]
         for _ in gone:
@@ -418,7 +418,7 @@ class Search:
             fit, judged = self.refuse(best.fit)
         return fit, judged
 
-    def _simplify(self, fit: PartFit) -> PartFit | None:
+    def _simplify(self, fit: PathFit) -> PathFit | None:
         """The model with a special case in the place of what is not accepted, or not surely, beyond it."""
         for effect in fit.state.effects:
             taken = {effect.id, *self.given, *fit.ids}
@@ -433,11 +433,11 @@ class Search:
                     return simpler
         return None
 
-    def _judge_last(self, fit: PartFit, names: Collection[str]) -> Judged:
+    def _judge_last(self, fit: PathFit, names: Collection[str]) -> Judged:
         """How effects of the last model are judged against the model without them."""
         return self._judge(self._drop(fit, names), fit, is_final=True)
 
-    def _list_groups(self, current: PartFit) -> list[tuple[str, ...]]:
+    def _list_groups(self, current: PathFit) -> list[tuple[str, ...]]:
         """Effects that may stand for others: each, and each two whose numbers the data hardly separate."""
         free = [name for name in current.ids if name not in self.given]
         size = np.sqrt(np.maximum(np.diag(current.covariance), 1e-300))
@@ -448,7 +448,7 @@ class Search:
         }
         return [*((name,) for name in free), *(two for two in combinations(sorted(free), 2) if two in pairs)]
 
-    def list_rivals(self, current: PartFit, without: PartFit, names: Sequence[str]) -> list[Judged]:
+    def list_rivals(self, current: PathFit, without: PathFit, names: Sequence[str]) -> list[Judged]:
         """Models with other effects in the place of some, judged against the one with neither; made once."""
         key = (_make_key(current.state), *names, self.given)
         if key not in self._rivals:
@@ -458,7 +458,7 @@ class Search:
             self._rivals[key] = self._judge_extensions(without, screen, 4, 1, wanted, find_cost(current))
         return self._rivals[key]
 
-    def replaces(self, current: PartFit, other: Judged, margin: float = 0.0) -> bool:
+    def replaces(self, current: PathFit, other: Judged, margin: float = 0.0) -> bool:
         """Whether other effects do what one of a model does, and not only something else.
 
         Beside them it adds nothing then, and no part of them beside it is as good as they are.
@@ -474,7 +474,7 @@ class Search:
         parts = new if len(new) > 1 else []
         return all(find_cost(self.fit(current.state.add(one))) > other.cost + margin for one in parts)
 
-    def _try_whole(self, current: PartFit, candidate: Candidate) -> PartFit | None:
+    def _try_whole(self, current: PathFit, candidate: Candidate) -> PathFit | None:
         """The model with an effect in the place of its special cases and companions, where it is better."""
         effect = candidate()
         cases = [name for name in current.ids if name in (*effect.contains, *effect.companions)]
@@ -492,12 +492,12 @@ class Search:
         judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self.prune(fit)
 
-    def _approach_all(self, base: PartFit, candidate: Candidate, noise: Noise) -> list[PartFit]:
+    def _approach_all(self, base: PathFit, candidate: Candidate, noise: Noise) -> list[PathFit]:
         """Some steps of the model with a candidate, from each of its starts."""
         values = list_starts(candidate, self.conditions.largest)
         return [approach(base, base.state.add(candidate(**one)), noise) for one in values]
 
-    def _try_beside(self, current: PartFit, candidate: Candidate) -> PartFit | None:
+    def _try_beside(self, current: PathFit, candidate: Candidate) -> PathFit | None:
         """The model with a companion of its effects, where it is better.
 
         What a limit of the command promises to first order says nothing beside a servo, all of whose numbers
@@ -515,7 +515,7 @@ class Search:
         return self.prune(fit) if is_better else None
 
 
-def _make_key(state: State) -> tuple[object, ...]:
+def _make_key(state: ModelState) -> tuple[object, ...]:
     """What two equal states have in common."""
     return (*((effect.key, effect.fixed) for effect in state.effects), repr(state.own))
 
@@ -528,7 +528,7 @@ def _choose(judged: Sequence[Judged]) -> Judged | None:
 
 
 def measure_t(
-    fit: PartFit, effect: Effect, base: PartFit | None = None, covariance: Floats | None = None
+    fit: PathFit, effect: Effect, base: PathFit | None = None, covariance: Floats | None = None
 ) -> float:
     """Standard errors by which the numbers of an effect are away from none, together.
 
@@ -546,7 +546,7 @@ def measure_t(
     if own and not any(number.is_smooth for number in own):
         if base is None:
             return math.inf
-        costs = [list_costs(fit.part, fit.noise, one.residual) for one in (base, fit)]
+        costs = [list_costs(fit.path, fit.noise, one.residual) for one in (base, fit)]
         return math.sqrt(max(float((costs[0] - costs[1]).sum()) / fit.overdispersion, 0.0))
     indices, aways = list[int](), list[float]()
     for index, number in enumerate(fit.free):
@@ -567,7 +567,7 @@ def measure_t(
 
 
 def judge(
-    base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = LEAST_T, *, is_final: bool = True
+    base: PathFit, fit: PathFit, conditions: Conditions, least_t: float = LEAST_T, *, is_final: bool = True
 ) -> Judged:
     """Accept an extension of a model, or say why not.
 
@@ -587,11 +587,11 @@ def judge(
         wrong = _refuse_numbers(base, fit, effect, conditions, least_t, is_final=is_final)
         if wrong:
             return Judged(base, fit, added, f"{effect.id}: {wrong}")
-    part, noise = fit.part, fit.noise
-    costs = [list_costs(part, noise, one.held_out) for one in (base, fit)]
+    path, noise = fit.path, fit.noise
+    costs = [list_costs(path, noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
-    own = list_costs(part, noise, base.residual) - list_costs(part, noise, fit.residual)
-    by_unit = np.asarray(np.bincount(part.unit, own), dtype=np.float64)
+    own = list_costs(path, noise, base.residual) - list_costs(path, noise, fit.residual)
+    by_unit = np.asarray(np.bincount(path.unit, own), dtype=np.float64)
     stable = math.sqrt(max(float(by_unit.sum() - by_unit.max()), 0.0))
     falls, rise, risen = _compare_horizons(base.horizon_errors, fit.horizon_errors)
     most = float(np.nanmax(falls, initial=0.0))
@@ -604,16 +604,16 @@ def judge(
         refusal = f"the error {risen} rises"
     elif most < (SHOWN if is_final else SHOWN / 2.0):
         refusal = f"no error falls by more than {format_share(most)}"
-    elif not _is_material(part, base.residual - fit.residual):
+    elif not _is_material(path, base.residual - fit.residual):
         refusal = "nobody would notice it"
-    sums = [np.bincount(part.block, cost) for cost in costs]
+    sums = [np.bincount(path.block, cost) for cost in costs]
     draws = np.random.default_rng(0).integers(0, sums[0].size, (_DRAWS, sums[0].size))
     frequency = float(np.mean(sums[1][draws].sum(axis=1) < sums[0][draws].sum(axis=1)))
     return Judged(base, fit, added, refusal, gain, frequency, by_unit, falls)
 
 
 def _refuse_numbers(
-    base: PartFit, fit: PartFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
+    base: PathFit, fit: PathFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
 ) -> str:
     """Why an effect's numbers do not allow a name, empty where they do; see `judge`."""
     if not any(is_nameable(one, conditions) for one in _list_acting(fit, effect)):
@@ -626,7 +626,7 @@ def _refuse_numbers(
     return ""
 
 
-def _list_acting(fit: PartFit, effect: Effect) -> list[Effect]:
+def _list_acting(fit: PathFit, effect: Effect) -> list[Effect]:
     """An effect of a model as it acts in each run, and by how much its delays there differ."""
     acting = fit.state.list_as_it_acts(effect)
     if len(acting) > 1 and effect.late is not None:
@@ -636,20 +636,20 @@ def _list_acting(fit: PartFit, effect: Effect) -> list[Effect]:
     return acting
 
 
-def _is_material(part: Part, change: Floats) -> bool:
+def _is_material(path: PathResiduals, change: Floats) -> bool:
     """Whether a change of the predicted increments is felt over one of `_FELT_S`, as its rms over the run."""
     sums = np.cumsum(np.concatenate((np.zeros((1, 3)), change)), axis=0)
     for horizon in _FELT_S:
-        length = min(max(round(horizon / float(np.median(part.spans))), 1), change.shape[0])
+        length = min(max(round(horizon / float(np.median(path.spans))), 1), change.shape[0])
         x, y, turn = np.sqrt(np.mean((sums[length:] - sums[:-length]) ** 2, axis=0)).tolist()
-        if math.hypot(x, y) >= LEAST_WAY_SHARE * horizon * part.speed or turn >= LEAST_TURN_RAD:
+        if math.hypot(x, y) >= LEAST_WAY_SHARE * horizon * path.speed or turn >= LEAST_TURN_RAD:
             return True
     return False
 
 
-def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:
+def list_costs(path: PathResiduals, noise: Noise, residual: Floats) -> Floats:
     """Huber's cost of the innovations of each step, shape (n,)."""
-    innovations = noise.whiten(residual[:, :, None], part.steps)
+    innovations = noise.whiten(residual[:, :, None], path.steps)
     costs: Floats = huber_cost(innovations).sum(axis=(1, 2))
     return costs
 

@@ -12,14 +12,14 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import Budget, usual_budget
 from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, find_undecided, find_unobservable, read_clocks
-from pipeline.estimation.comparison import Input, InputChoice, choose_input
-from pipeline.estimation.conclude import Explored
+from pipeline.estimation.conclude import PathResult
 from pipeline.estimation.decision import Search
 from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.encoder_scale import find_encoder_scale
-from pipeline.estimation.problem import DiagnosisError, Problem, prepare_problem
+from pipeline.estimation.estimation_data import DiagnosisError, EstimationData, prepare_data
+from pipeline.estimation.model_state import ModelState
 from pipeline.estimation.recordings import Recording
-from pipeline.estimation.state import State
+from pipeline.estimation.run_residuals import Input, InputChoice, choose_input
 from pipeline.estimation.together import Member, judge_together
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Effect, Model, Place
@@ -86,61 +86,61 @@ def diagnose_runs(
 
     def search(members: Sequence[Member], runs: Sequence[MotionRun]) -> Diagnosis:
         chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
-        problem = prepare_problem(runs, vehicle, chosen.source)
+        data = prepare_data(runs, vehicle, chosen.source)
         driven = sum(run.duration_s for run in runs)
         budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
         # With more threads, the order of summation would depend on the number of cores.
         with threadpool_limits(limits=1, user_api="blas"):
-            results, clocks = _explore(problem, chosen.source, known, budget)
-            return _conclude([one.recording for one in members], problem, chosen, results, clocks)
+            results, clocks = _search_paths(data, chosen.source, known, budget)
+            return _conclude([one.recording for one in members], data, chosen, results, clocks)
 
     return judge_together(recordings, vehicle, leading, judge)
 
 
-def _explore(
-    problem: Problem, source: Input, known: Sequence[Effect], budget: Budget
-) -> tuple[list[Explored], Clocks]:
+def _search_paths(
+    data: EstimationData, source: Input, known: Sequence[Effect], budget: Budget
+) -> tuple[list[PathResult], Clocks]:
     """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
-    body_problem, body_input = problem, source
-    if not problem.is_drive_alone and source is Input.COMMAND and problem.has_encoders:
-        body_problem, body_input = problem.behind_wheels, Input.MEASURED
+    body_data, body_input = data, source
+    if not data.is_drive_alone and source is Input.COMMAND and data.has_encoders:
+        body_data, body_input = data.behind_wheels, Input.MEASURED
     usable = [e for e in known if body_input is Input.COMMAND or e.place > Place.DRIVE]
-    candidates = problem.list_candidates(body_input)
+    candidates = data.list_candidates(body_input)
     given = frozenset(e.id for e in usable)
-    search = Search(body_problem.parts[0], candidates, problem.conditions, given, budget)
-    body = _explore_part(problem, search, body_input.value, body_problem.start_state(usable))
+    search = Search(body_data.paths[0], candidates, data.conditions, given, budget)
+    body = _search_path(data, search, body_input.value, body_data.start_state(usable))
     results, state = [body], body.outcome.final.state
     if body_input is not source:
         driven = [e for e in known if e.place <= Place.DRIVE]
-        candidates, given = problem.list_drivetrain(), frozenset(e.id for e in driven)
-        search = Search(problem.parts[1], candidates, problem.conditions, given, budget)
-        results.append(_explore_part(problem, search, "wheels", State((), state.timing).add(*driven)))
-    return results, read_clocks(problem, state, body_input)
+        candidates, given = data.list_drivetrain(), frozenset(e.id for e in driven)
+        search = Search(data.paths[1], candidates, data.conditions, given, budget)
+        results.append(_search_path(data, search, "wheels", ModelState((), state.timing).add(*driven)))
+    return results, read_clocks(data, state, body_input)
 
 
-def _explore_part(problem: Problem, search: Search, name: str, start: State) -> Explored:
+def _search_path(data: EstimationData, search: Search, name: str, start: ModelState) -> PathResult:
     outcome = search.run(start)
     formula = None
-    if name != "wheels" and not problem.is_drive_alone:
-        sideways = problem.vehicle.kinematics.has_inputs("sideways")
+    if name != "wheels" and not data.is_drive_alone:
+        sideways = data.vehicle.kinematics.has_inputs("sideways")
         outcome, formula = search_formula(search, outcome, sideways=sideways)
     unobservable, detectable = find_unobservable(search, outcome)
     undecided = tuple(find_undecided(search, outcome))
-    return Explored(name, search, outcome, formula, undecided, unobservable, tuple(detectable))
+    return PathResult(name, search, outcome, formula, undecided, unobservable, tuple(detectable))
 
 
 def _conclude(
     recordings: Sequence[Recording],
-    problem: Problem,
+    data: EstimationData,
     chosen: InputChoice,
-    results: Sequence[Explored],
+    results: Sequence[PathResult],
     clocks: Clocks,
 ) -> Diagnosis:
-    whole, delays = conclude.summarize(problem, chosen.source, results, clocks, recordings[0].length_scale_m)
+    whole, delays = conclude.summarize(data, chosen.source, results, clocks, recordings[0].length_scale_m)
     (common,) = whole.runs
     common = msgspec.structs.replace(common, input_reason=chosen.reason)
     runs = tuple(
-        conclude.of_run(common, recording, number, delays[number], problem)
+        conclude.of_run(common, recording, number, delays[number], data)
         for number, recording in enumerate(recordings)
     )
     return replace(whole, runs=runs)

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from pipeline.core import Floats, Ints, round_digits
-from pipeline.estimation.intervals import narrow_part
+from pipeline.estimation.intervals import narrow_path
 from pipeline.models import find_effect
 from pipeline.results import INTERVAL_SHARE, DataNeed, Evidence, Growth, Narrowing
 
@@ -117,13 +117,13 @@ def pick_points(count: int) -> Ints:
 def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
     """Half-widths of the 95 % intervals of all smooth parameters of effects, by label ``effect.name``.
 
-    See `narrow_part`; parameters of single runs are excluded.
+    See `narrow_path`; parameters of single runs are excluded.
     """
     curves: dict[str, Curve] = {}
     for fit in fitted.fits:
         if not fit.free:
             continue
-        seconds, halves = narrow_part(fit)
+        seconds, halves = narrow_path(fit)
         curves |= {
             number.label: Curve(seconds, halves[:, index])
             for index, number in enumerate(fit.free)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Flags, Floats, Ints, robust_spread
-from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.problem import Problem
-from pipeline.estimation.state import State
+from pipeline.estimation.estimation_data import EstimationData
+from pipeline.estimation.model_state import ModelState
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.estimation.window_residuals import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.models import Place, Timing
 from pipeline.run import SPAN_S
@@ -90,28 +90,28 @@ class Signature:
     after_error: Floats
 
 
-def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signature]:
+def find_signatures(data: EstimationData, state: ModelState, run: int = 0) -> list[Signature]:
     """The signature of every effect of a model in one run; effects without a contribution are left out.
 
     Args:
-        problem: the runs.
+        data: the runs.
         state: the model with its values and the recordings' delays.
         run: which of the runs.
     """
-    comparison = problem.comparisons[run]
-    times = comparison.windows.times
-    since = times.mean(axis=1) - comparison.run.start_s
+    run_residuals = data.residuals_by_run[run]
+    times = run_residuals.windows.times
+    since = times.mean(axis=1) - run_residuals.run.start_s
     block = number_stretches(np.zeros(since.size, dtype=np.int64), since)
-    shared = measure_variables(comparison) | _measure_predicted(comparison, state, run)
+    shared = measure_variables(run_residuals) | _measure_predicted(run_residuals, state, run)
     bins = {name: _bin(values, block) for name, values in shared.items()}
     by_channel = [
         {**bins, **{name: _bin(one[0], block, one[1]) for name, one in own.items()}}
-        for own in _measure_by_channel(comparison, shared)
+        for own in _measure_by_channel(run_residuals, shared)
     ]
-    after = problem.find_run_residuals(state, run)
+    after = data.find_run_residuals(state, run)
     signatures = []
     for effect in state.effects:
-        before = problem.find_run_residuals(state.drop([effect.id]), run)
+        before = data.find_run_residuals(state.drop([effect.id]), run)
         acts = [one for one in VARIABLES if effect.place > Place.DRIVE or one not in _OF_MAP]
         signature = _find_one(effect.id, before - after, after, by_channel, block, acts)
         if signature is not None:
@@ -119,24 +119,24 @@ def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signat
     return signatures
 
 
-def measure_variables(comparison: Comparison) -> dict[str, Floats]:
+def measure_variables(run_residuals: RunResiduals) -> dict[str, Floats]:
     """Recorded variables of signatures at every window, shape (n,) each."""
-    velocity = comparison.predict_velocity((), Timing())
-    spans, earlier = locate_windows(comparison), locate_windows(comparison, 1.0)
-    ideal = average_windows(comparison, velocity, spans)
-    times, grid, context = comparison.windows.times, comparison.grid, comparison.context
+    velocity = run_residuals.predict_velocity((), Timing())
+    spans, earlier = locate_windows(run_residuals), locate_windows(run_residuals, 1.0)
+    ideal = average_windows(run_residuals, velocity, spans)
+    times, grid, context = run_residuals.windows.times, run_residuals.grid, run_residuals.context
     middle = times.mean(axis=1)
     ends = [np.interp(times, grid.times, signal) for signal in (velocity.x, velocity.w)]
-    rates = [(one[:, 1] - one[:, 0]) / comparison.windows.span_s for one in ends]
-    change = ideal - average_windows(comparison, velocity, earlier)
+    rates = [(one[:, 1] - one[:, 0]) / run_residuals.windows.span_s for one in ends]
+    change = ideal - average_windows(run_residuals, velocity, earlier)
     attitude = [np.interp(middle, context.times, column) for column in context.attitude.T]
-    track = comparison.run.track
+    track = run_residuals.run.track
     places = [np.interp(middle, track.times, column) for column in track.position.T[:2]]
     return {
         "f_x": ideal[:, 0],
         "f_y": ideal[:, 1],
         "f_w": ideal[:, 2],
-        "f_x_f_w": spans.average(comparison, velocity.x * velocity.w),
+        "f_x_f_w": spans.average(run_residuals, velocity.x * velocity.w),
         "a_x": rates[0],
         "a_w": rates[1],
         "roll": attitude[0],
@@ -150,28 +150,28 @@ def measure_variables(comparison: Comparison) -> dict[str, Floats]:
     }
 
 
-def _measure_predicted(comparison: Comparison, state: State, run: int) -> dict[str, Floats]:
+def _measure_predicted(run_residuals: RunResiduals, state: ModelState, run: int) -> dict[str, Floats]:
     """Noise-free speed and yaw rate predicted by the model at every window."""
-    velocity = comparison.predict_velocity(state.effects_of(run), state.timing[run])
-    spans = locate_windows(comparison)
+    velocity = run_residuals.predict_velocity(state.effects_of(run), state.timing[run])
+    spans = locate_windows(run_residuals)
     return {
-        "p_x": spans.average(comparison, velocity.x),
-        "p_w": spans.average(comparison, velocity.w),
-        "p_x_p_w": spans.average(comparison, velocity.x * velocity.w),
+        "p_x": spans.average(run_residuals, velocity.x),
+        "p_w": spans.average(run_residuals, velocity.w),
+        "p_x_p_w": spans.average(run_residuals, velocity.x * velocity.w),
     }
 
 
 def _measure_by_channel(
-    comparison: Comparison, shared: Mapping[str, Floats]
+    run_residuals: RunResiduals, shared: Mapping[str, Floats]
 ) -> list[dict[str, tuple[Floats, Floats | None]]]:
     """Variables that differ for x, y and w, each with the divisor of the residual.
 
     The rim speed of the fastest wheel has the sign of the motion. For the time since the last step of the
     input (NaN without one in the last seconds) the divisor is the height of that step.
     """
-    velocity = comparison.predict_velocity((), Timing())
-    grid, middle = comparison.grid, comparison.windows.times.mean(axis=1)
-    rim = np.abs(shared["f_x"]) + 0.5 * comparison.context.track_m * np.abs(shared["f_w"])
+    velocity = run_residuals.predict_velocity((), Timing())
+    grid, middle = run_residuals.grid, run_residuals.windows.times.mean(axis=1)
+    rim = np.abs(shared["f_x"]) + 0.5 * run_residuals.context.track_m * np.abs(shared["f_w"])
     signs = (shared["f_x"], shared["f_x_f_w"], shared["f_w"])
     variables = []
     for sign, signal in zip(signs, (velocity.x, velocity.y, velocity.w), strict=True):

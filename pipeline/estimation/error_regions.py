@@ -62,16 +62,16 @@ def is_narrow(region: Region) -> bool:
     return region.share >= _NARROW_SHARE and region.time_share <= _NARROW_TIME
 
 
-def map_errors(part: WindowResiduals, residual: Floats, places: Floats) -> list[Region]:
+def map_errors(windows: WindowResiduals, residual: Floats, places: Floats) -> list[Region]:
     """Every region of every kind with its share of each channel's error.
 
     Args:
-        part: whose windows they are.
+        windows: the windows.
         residual: of a model, shape (n, 3).
         places: x, y [m] in the map at every window, shape (n, 2).
     """
     regions = []
-    candidates = [cut for cut in _list_regions(part, places) if cut.rows.any()]
+    candidates = [cut for cut in _list_regions(windows, places) if cut.rows.any()]
     for channel, name in enumerate(CHANNELS):
         limit = math.sqrt(36.0 * float(np.median(residual[:, channel] ** 2)) + 1.0)
         error = np.clip(residual[:, channel], -limit, limit)
@@ -79,7 +79,7 @@ def map_errors(part: WindowResiduals, residual: Floats, places: Floats) -> list[
         total = float(square.sum())
         if total <= 0.0:
             continue
-        response = _list_responses(part.find_ideal(), channel)
+        response = _list_responses(windows.find_ideal(), channel)
         for kind, which, limits, rows in candidates:
             share, time_share = float(square[rows].sum()) / total, float(rows.mean())
             expected = time_share
@@ -149,23 +149,23 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
     return picked[: 2 * _SHOWN]
 
 
-def find_main_region(part: WindowResiduals, residual: Floats, places: Floats) -> Region | None:
+def find_main_region(windows: WindowResiduals, residual: Floats, places: Floats) -> Region | None:
     """The region with half of a channel's squared error in much less of the time; None without one.
 
     Args:
-        part: whose windows they are.
+        windows: the windows.
         residual: of a model, shape (n, 3).
         places: x, y [m] in the map at every window, shape (n, 2).
     """
-    picked = pick_regions(map_errors(part, residual, places), residual, part.noise)
+    picked = pick_regions(map_errors(windows, residual, places), residual, windows.noise)
     return next(
         (region for region in picked if region.share >= max(_LARGE_SHARE, _CONCENTRATED * region.time_share)),
         None,
     )
 
 
-def _list_regions(part: WindowResiduals, places: Floats) -> list[_Cut]:
-    lags = part.find_ideal()
+def _list_regions(windows: WindowResiduals, places: Floats) -> list[_Cut]:
+    lags = windows.find_ideal()
     speed, turn = lags[:, 0, 0], lags[:, 0, 1]
     regions = _cut_commands(speed, turn)
     for aside in lags[:, 0, 2:].T:
@@ -173,12 +173,12 @@ def _list_regions(part: WindowResiduals, places: Floats) -> list[_Cut]:
     changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
     transitory = changed.any(axis=1)
     regions.append(_Cut("phase", "change", (NODE_S * (lags.shape[1] - 1),), transitory))
-    regions.append(_Cut("phase", "steady", (), ~transitory & part.live))
-    middle = part.times.mean(axis=1)
+    regions.append(_Cut("phase", "steady", (), ~transitory & windows.live))
+    middle = windows.times.mean(axis=1)
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
     for low, high in pairwise(edges.tolist()):
         regions.append(_Cut("time", "between", (low, high), (middle >= low) & (middle < high)))
-    regions += _cut_slopes(part)
+    regions += _cut_slopes(windows)
     for axis, name in ((0, "x"), (1, "y")):
         cut = float(np.median(places[:, axis]))
         regions.append(_Cut("place", f"{name}_above", (cut,), places[:, axis] > cut))
@@ -186,9 +186,9 @@ def _list_regions(part: WindowResiduals, places: Floats) -> list[_Cut]:
     return regions
 
 
-def _cut_slopes(part: WindowResiduals) -> list[_Cut]:
+def _cut_slopes(windows: WindowResiduals) -> list[_Cut]:
     """Regions by the slope that the vehicle stands on."""
-    roll, pitch = part.find_attitude().T
+    roll, pitch = windows.find_attitude().T
     slopes = (("uphill", -pitch), ("downhill", pitch), ("slope_left", -roll), ("slope_right", roll))
     return [
         _Cut("slope", name, (math.degrees(least),), angle > least)

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
-from pipeline.estimation.fit import PartFit, invert
+from pipeline.estimation.fit import PathFit, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
-from pipeline.estimation.intervals import Estimate, Estimates, estimate_part
-from pipeline.estimation.ladder import Judgement
+from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
+from pipeline.estimation.ladder import ModelAssessment
 from pipeline.estimation.model_fit import Fitted
-from pipeline.estimation.state import State, combine_columns
+from pipeline.estimation.model_state import ModelState, combine_columns
 from pipeline.estimation.window_residuals import count_seconds
 from pipeline.models import (
     Effect,
@@ -42,7 +42,7 @@ from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.core import Budget
-    from pipeline.estimation.problem import Problem
+    from pipeline.estimation.estimation_data import EstimationData
 
 _PASSES = 2
 """Steps of the estimate of an effect that a model lacks, the noise learned anew after each."""
@@ -69,7 +69,7 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
     return values
 
 
-def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Value]]:
+def list_first_run(state: ModelState, estimates: Estimates) -> dict[str, dict[str, Value]]:
     """Values of every effect of a fitted state in the first run, by id."""
     first = estimates.choose_run(0)
     return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
@@ -109,25 +109,25 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
 
 
 def list_estimates(
-    problem: Problem, judgement: Judgement, named: Sequence[Named]
+    data: EstimationData, assessment: ModelAssessment, named: Sequence[Named]
 ) -> Iterator[EstimatedNumber]:
     """Estimates of one judged model, of the corrected clocks, and of the effects that the model lacks.
 
     Effects that contain one of the model, or are contained in one, are left out.
 
     Args:
-        problem: the runs.
-        judgement: a model on them.
+        data: the runs.
+        assessment: a model on them.
         named: effects that the diagnosis names.
     """
-    source, model = judgement.problem.source, judgement.fitted.model
+    source, model = assessment.data.source, assessment.fitted.model
     ids = {effect.id for effect in named}
     known = {effect.id for effect in list_effects()}
-    candidates = {e.id: e() for e in (*problem.list_candidates(source), *problem.list_drivetrain())}
+    candidates = {e.id: e() for e in (*data.list_candidates(source), *data.list_drivetrain())}
     rivals = [
         effect for effect in candidates.values() if effect.id not in ids and not _overlaps(effect, model)
     ]
-    for item in (*judgement.estimates.items, *estimate_unnamed(judgement.fitted, rivals)):
+    for item in (*assessment.estimates.items, *estimate_unnamed(assessment.fitted, rivals)):
         error, number = item.deviation, item.free
         if number.effect in known and not number.runs and math.isfinite(item.value + error) and error > 0.0:
             yield EstimatedNumber(
@@ -153,13 +153,13 @@ def _overlaps(effect: Effect, model: Model) -> bool:
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
-def note_brevity(problem: Problem, common: RunDiagnosis) -> list[Finding]:
+def note_brevity(data: EstimationData, common: RunDiagnosis) -> list[Finding]:
     """A finding where the driving is too short for reliable identification."""
     least, words = _LEAST_DRIVING_S[common.input]
-    driven = float(count_seconds(problem.whole).sum())
+    driven = float(count_seconds(data.whole).sum())
     if driven >= least:
         return []
-    have = "the runs together have" if len(problem.runs) > 1 else "the run has"
+    have = "the runs together have" if len(data.runs) > 1 else "the run has"
     text = (
         f"{have} {math.floor(driven)} s of driving: effects estimated from {words} need at least "
         f"{least:.0f} s, with turns and speeds of both signs"
@@ -192,17 +192,17 @@ def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Esti
     for effect in candidates:
         if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
             continue
-        fit = next((fit for fit in fitted.fits if fit.part.owns(effect)), None)
+        fit = next((fit for fit in fitted.fits if fit.path.owns(effect)), None)
         estimates += [] if fit is None else _estimate_added(fit, effect)
     return tuple(estimates)
 
 
-def _estimate_added(fit: PartFit, effect: Effect) -> list[Estimate]:
-    part, added = fit.part, fit.state.add(effect)
-    new = tuple(n for n in part.list_free(added) if n.effect == effect.id)
+def _estimate_added(fit: PathFit, effect: Effect) -> list[Estimate]:
+    path, added = fit.path, fit.state.add(effect)
+    new = tuple(n for n in path.list_free(added) if n.effect == effect.id)
     if not all(number.is_smooth for number in new):
         return []
-    columns = part.differentiate(added, fit.residual, new)
+    columns = path.differentiate(added, fit.residual, new)
     grown = replace(
         fit, state=added, free=(*fit.free, *new), columns=np.concatenate((fit.columns, columns), axis=2)
     )
@@ -211,10 +211,10 @@ def _estimate_added(fit: PartFit, effect: Effect) -> list[Estimate]:
         step = invert(grown.normal) @ (grown.white.columns.T @ grown.white.residual)
         rest = grown.residual - combine_columns(grown.columns, step)
         # The noise of residuals that still hold an effect would hide it.
-        grown = replace(grown, residual=rest, noise=part.learn(rest, grown.noise))
+        grown = replace(grown, residual=rest, noise=path.learn(rest, grown.noise))
         total += step
     moved = dict(zip(grown.free, total.tolist(), strict=True))
-    made = {item.free: item for item in estimate_part(grown).items}
+    made = {item.free: item for item in estimate_path(grown).items}
     if not all(made[number].observable for number in new):
         return []
     return [
@@ -283,30 +283,30 @@ def _round(value: float) -> float | None:
     return finite_or_none(value, JSON_DIGITS)
 
 
-def was_aligned(effect: Effect, problem: Problem) -> bool:
+def was_aligned(effect: Effect, data: EstimationData) -> bool:
     """Whether an effect is a clock offset that the gyro corrected before any model was fitted."""
-    return effect.late is Late.POSES and problem.has_gyro
+    return effect.late is Late.POSES and data.has_gyro
 
 
 def list_by_run(
-    effect: Effect, problem: Problem, judgement: Judgement | None
+    effect: Effect, data: EstimationData, assessment: ModelAssessment | None
 ) -> tuple[dict[str, Value], ...]:
     """Values of an effect: by run where runs or grounds have their own, else once."""
-    if was_aligned(effect, problem):
-        delays = [run.alignment.heading_delay_s for run in problem.runs]
+    if was_aligned(effect, data):
+        delays = [run.alignment.heading_delay_s for run in data.runs]
         beyond = effect.delay - float(np.mean(delays))
         return tuple(
             read_clock(effect.of_delay(beyond + delay), run)
-            for delay, run in zip(delays, problem.runs, strict=True)
+            for delay, run in zip(delays, data.runs, strict=True)
         )
-    if judgement is None or effect.id not in judgement.fitted.model:
+    if assessment is None or effect.id not in assessment.fitted.model:
         return (list_values(effect, None),)
-    acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
-    by_run = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
+    acting = assessment.fitted.state.list_as_it_acts(assessment.fitted.model.effect(effect.id))
+    by_run = [list_values(one, assessment.estimates.choose_run(run)) for run, one in enumerate(acting)]
     if effect.late is Late.POSES:
         # Where only some runs have a gyro, the delay that it corrected is part of the clock.
         by_run = [
             {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
-            for numbers, run in zip(by_run, problem.runs, strict=False)
+            for numbers, run in zip(by_run, data.runs, strict=False)
         ]
     return tuple(by_run)

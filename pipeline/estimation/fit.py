@@ -1,4 +1,4 @@
-"""Maximum likelihood fits of a model to one part of the path: Gauss-Newton on innovations.
+"""Maximum likelihood fits of a model to one path: Gauss-Newton on innovations.
 
 The noise is that of the model's own residuals, learned together with its numbers. A cost is in units of
 chi-square: a step that promises less than a twentieth of one is not worth taking.
@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import FOLDS
+from pipeline.estimation.model_state import combine_columns, flatten, pick_columns
 from pipeline.estimation.noise import find_weights, huber_cost
-from pipeline.estimation.state import combine_columns, flatten, pick_columns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.core import Flags, Floats, Ints
+    from pipeline.estimation.model_state import Free, ModelState
     from pipeline.estimation.noise import Noise
-    from pipeline.estimation.parts import HorizonError, Part
-    from pipeline.estimation.state import Free, State
+    from pipeline.estimation.path_residuals import HorizonError, PathResiduals
 
 _ENOUGH = 0.05
 """Fall of chi-square below which a step is not worth taking."""
@@ -73,20 +73,20 @@ class White:
 
 
 @dataclass(frozen=True)
-class PartFit:
-    """Fit of one part of the path.
+class PathFit:
+    """Fit of one path.
 
     Attributes:
-        part: the part.
+        path: the path.
         state: the fitted model.
-        free: its numbers that act on this part.
+        free: its numbers that act on this path.
         residual: measured less predicted increments, shape (n, 3).
         columns: derivative of the prediction by each number, shape (n, 3, p).
         noise: of the residuals.
     """
 
-    part: Part = field(repr=False)
-    state: State
+    path: PathResiduals = field(repr=False)
+    state: ModelState
     free: tuple[Free, ...]
     residual: Floats = field(repr=False)
     columns: Floats = field(repr=False)
@@ -110,21 +110,21 @@ class PartFit:
     @cached_property
     def white(self) -> White:
         """Its innovations."""
-        return whiten(self.part, self.noise, self.residual, self.columns)
+        return whiten(self.path, self.noise, self.residual, self.columns)
 
     @cached_property
     def normal(self) -> Floats:
         """Information on its numbers, that of the prior included, shape (p, p)."""
-        prior = np.diag(self.part.prior.weigh(self.state, self.free)) if self.free else np.zeros((0, 0))
+        prior = np.diag(self.path.prior.weigh(self.state, self.free)) if self.free else np.zeros((0, 0))
         columns: Floats = self.white.columns
         return columns.T @ columns + prior
 
     @cached_property
     def score(self) -> float:
         """Minus twice the logarithm of the likelihood: smaller is better, also between kinds of noise."""
-        part = self.part
-        cost = measure_cost(part, self.noise, self.state, self.free, self.residual)
-        return cost + self.noise.log_variance(part.steps, part.weight)
+        path = self.path
+        cost = measure_cost(path, self.noise, self.state, self.free, self.residual)
+        return cost + self.noise.log_variance(path.steps, path.weight)
 
     @cached_property
     def overdispersion(self) -> float:
@@ -145,26 +145,26 @@ class PartFit:
     @cached_property
     def held_out(self) -> Floats:
         """Residuals of every step under numbers fitted without its fold, shape (n, 3)."""
-        return hold_out(self, self.noise, make_folds(self.part))
+        return hold_out(self, self.noise, make_folds(self.path))
 
     @cached_property
     def horizon_errors(self) -> Sequence[HorizonError]:
         """Held-out errors over each of `HORIZONS_S`."""
-        return self.part.list_horizon_errors(self.held_out)
+        return self.path.list_horizon_errors(self.held_out)
 
 
-def whiten(part: Part, noise: Noise, residual: Floats, columns: Floats) -> White:
+def whiten(path: PathResiduals, noise: Noise, residual: Floats, columns: Floats) -> White:
     """Weighted innovations of a residual (n, 3) and of columns (n, 3, p)."""
-    made = noise.whiten(residual[:, :, None], part.steps)
-    weights: Floats = np.sqrt(part.weight * find_weights(made[:, :, 0]))
+    made = noise.whiten(residual[:, :, None], path.steps)
+    weights: Floats = np.sqrt(path.weight * find_weights(made[:, :, 0]))
     flat = _line_up(made * weights[:, :, None], noise)[:, 0]
     rows = np.repeat(np.arange(residual.shape[0]), len(noise.known))
-    return White(flat, _line_up(noise.whiten(columns, part.steps, weights), noise), rows, weights)
+    return White(flat, _line_up(noise.whiten(columns, path.steps, weights), noise), rows, weights)
 
 
-def whiten_columns(fit: PartFit, columns: Floats) -> Floats:
+def whiten_columns(fit: PathFit, columns: Floats) -> Floats:
     """Columns (n, 3, q) in the rows of a fit's innovations, shape (m, q)."""
-    return _line_up(fit.noise.whiten(columns, fit.part.steps, fit.white.weights), fit.noise)
+    return _line_up(fit.noise.whiten(columns, fit.path.steps, fit.white.weights), fit.noise)
 
 
 def _line_up(white: Floats, noise: Noise) -> Floats:
@@ -176,7 +176,7 @@ def _sum_squares(values: Floats) -> float:
     return float(values @ values)
 
 
-def join_covariance(fit: PartFit, normal: Floats) -> Floats:
+def join_covariance(fit: PathFit, normal: Floats) -> Floats:
     """Covariance from the information, and from how blocks differ where that is more.
 
     A number that changes from block to block, or from run to run, is known less well than noise alone
@@ -186,8 +186,8 @@ def join_covariance(fit: PartFit, normal: Floats) -> Floats:
         return np.zeros((0, 0))
     inverse = invert(normal)
     plain = fit.overdispersion * inverse
-    white, part = fit.white, fit.part
-    label = part.run if part.run[-1] + 1 >= _FEWEST_RUNS else part.unit
+    white, path = fit.white, fit.path
+    label = path.run if path.run[-1] + 1 >= _FEWEST_RUNS else path.unit
     count = int(label.max()) + 1
     if count < _FEWEST_RUNS:
         return plain
@@ -212,28 +212,28 @@ def invert(normal: Floats) -> Floats:
     return inverse
 
 
-def fit_part(
-    part: Part,
-    start: State,
+def fit_path(
+    path: PathResiduals,
+    start: ModelState,
     *,
     noise: Noise | None = None,
     per_run: Sequence[str] = (),
     exact: bool = False,
     target: float = math.inf,
-) -> PartFit:
-    """Fit all numbers of a state to one part of the path, with the noise of its residuals.
+) -> PathFit:
+    """Fit all numbers of a state to one path, with the noise of its residuals.
 
     What belongs to each run alone has the mean over the runs as its shared value then.
 
     Args:
-        part: part of the path.
+        path: the path.
         start: state to start from.
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
         target: score that it must come below: it ends early where its steps do not promise that.
     """
-    fit = _begin(part, start, noise, per_run, exact=exact)
+    fit = _begin(path, start, noise, per_run, exact=exact)
     if not fit.free:
         return fit
     fit = _descend(fit, exact=exact, target=target)
@@ -246,16 +246,21 @@ def fit_part(
 
 
 def _begin(
-    part: Part, start: State, noise: Noise | None, per_run: Sequence[str] = (), *, exact: bool = False
-) -> PartFit:
-    """A fit before its first step; see `fit_part`."""
-    free = part.list_free(start, per_run)
-    residual = part.find_residuals(start)
-    columns = part.differentiate(start, residual, free, both_sides=exact)
-    return PartFit(part, start, free, residual, columns, part.learn(residual, noise, exact=exact))
+    path: PathResiduals,
+    start: ModelState,
+    noise: Noise | None,
+    per_run: Sequence[str] = (),
+    *,
+    exact: bool = False,
+) -> PathFit:
+    """A fit before its first step; see `fit_path`."""
+    free = path.list_free(start, per_run)
+    residual = path.find_residuals(start)
+    columns = path.differentiate(start, residual, free, both_sides=exact)
+    return PathFit(path, start, free, residual, columns, path.learn(residual, noise, exact=exact))
 
 
-def _walk_grids(fit: PartFit, *, exact: bool = False) -> PartFit:
+def _walk_grids(fit: PathFit, *, exact: bool = False) -> PathFit:
     """Search each number without derivatives once; see `_walk_grid`."""
     for number in fit.free:
         if not number.is_smooth:
@@ -263,7 +268,7 @@ def _walk_grids(fit: PartFit, *, exact: bool = False) -> PartFit:
     return fit
 
 
-def approach(base: PartFit, start: State, noise: Noise) -> PartFit:
+def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
     """Some steps of a fit from a model's extension, which show how near it may come to the best one.
 
     Args:
@@ -271,29 +276,31 @@ def approach(base: PartFit, start: State, noise: Noise) -> PartFit:
         start: the extension, at a start of its new numbers.
         noise: what a good model leaves.
     """
-    part, new = base.part, set(start.ids) - set(base.ids)
+    path, new = base.path, set(start.ids) - set(base.ids)
     weaker = [start.weaken(new, share) for share in _SHARES]
     if weaker[-1] != weaker[0]:
-        part.look_ahead(weaker)
-        costs = [measure_cost(part, base.noise, one, base.free, part.find_residuals(one)) for one in weaker]
-        own = measure_cost(part, base.noise, base.state, base.free, base.residual)
+        path.look_ahead(weaker)
+        costs = [measure_cost(path, base.noise, one, base.free, path.find_residuals(one)) for one in weaker]
+        own = measure_cost(path, base.noise, base.state, base.free, base.residual)
         # What changes nothing at all has no derivative, either.
         acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
         start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
-    free, residual = part.list_free(start), part.find_residuals(start)
-    fit = PartFit(part, start, free, residual, part.differentiate(start, residual, free), base.noise)
+    free, residual = path.list_free(start), path.find_residuals(start)
+    fit = PathFit(path, start, free, residual, path.differentiate(start, residual, free), base.noise)
     steps = max(_FEW_STEPS, len(free) - len(base.free))
     fit = _walk_grids(_descend(fit, rough=steps)) if free else fit
-    return replace(fit, noise=part.learn(fit.residual, noise))
+    return replace(fit, noise=path.learn(fit.residual, noise))
 
 
-def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
+def measure_cost(
+    path: PathResiduals, noise: Noise, state: ModelState, free: Sequence[Free], residual: Floats
+) -> float:
     """Huber's cost of innovations, and that of the prior."""
-    innovations = noise.whiten(residual[:, :, None], part.steps)[:, :, 0]
-    return float((part.weight * huber_cost(innovations)).sum()) + part.prior.cost(state, free)
+    innovations = noise.whiten(residual[:, :, None], path.steps)[:, :, 0]
+    return float((path.weight * huber_cost(innovations)).sum()) + path.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float = math.inf) -> PartFit:
+def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float = math.inf) -> PathFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
     Derivatives are computed anew after a step that was news, and where steps without become hardly smaller:
@@ -301,18 +308,18 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float
 
     Args:
         fit: where to begin.
-        exact: see `fit_part`.
+        exact: see `fit_path`.
         rough: most steps of a rough descent, by the noise as it is; its derivatives are those before the last
             step. 0 for a whole one.
-        target: see `fit_part`.
+        target: see `fit_path`.
     """
-    part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
+    path, free, enough = fit.path, fit.free, _SETTLED if exact else _ENOUGH
     most = rough or _MOST_STEPS
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
-    unlearned = math.sqrt(4.0 * _ENOUGH * part.spans.size)
+    unlearned = math.sqrt(4.0 * _ENOUGH * path.spans.size)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
-    cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-    most_cost = target - fit.noise.log_variance(part.steps, part.weight)
+    cost = measure_cost(path, fit.noise, fit.state, free, fit.residual)
+    most_cost = target - fit.noise.log_variance(path.steps, path.weight)
     for count in range(1, most + 1 if fit.smooth else 1):
         moving, step, promised = _solve(fit, damping)
         if is_fresh and damping <= _LOOSEST and cost - _MORE_THAN_PROMISED * promised > most_cost:
@@ -320,8 +327,8 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float
         fall = 0.0
         if promised >= enough and (is_fresh or promised < _CONVERGING * before):
             state = fit.state.move(moving, step)
-            residual = part.find_residuals(state)
-            fall = cost - measure_cost(part, fit.noise, state, free, residual)
+            residual = path.find_residuals(state)
+            fall = cost - measure_cost(path, fit.noise, state, free, residual)
         # Numbers that must converge do so with the noise as it is, and then with it.
         most_fallen = 0.0 if exact and is_fresh and not fall > 0.0 else unlearned
         if fall > 0.0:
@@ -338,19 +345,19 @@ def _descend(fit: PartFit, *, exact: bool = False, rough: int = 0, target: float
         elif (is_fresh or (promised < enough and not exact)) and fallen <= most_fallen:
             break
         if fallen > most_fallen and not rough:
-            fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
-            cost, fallen = measure_cost(part, fit.noise, fit.state, free, fit.residual), 0.0
-            most_cost = target - fit.noise.log_variance(part.steps, part.weight)
+            fit = replace(fit, noise=path.learn(fit.residual, fit.noise, exact=exact))
+            cost, fallen = measure_cost(path, fit.noise, fit.state, free, fit.residual), 0.0
+            most_cost = target - fit.noise.log_variance(path.steps, path.weight)
         if (fall > 0.0 or not is_fresh) and count != rough:
-            fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
+            fit = replace(fit, columns=path.differentiate(fit.state, fit.residual, free, both_sides=exact))
         is_fresh, before = True, math.inf
     return fit
 
 
-def _solve(fit: PartFit, damping: float) -> tuple[list[Free], list[float], float]:
+def _solve(fit: PathFit, damping: float) -> tuple[list[Free], list[float], float]:
     """The numbers that move, their step, and the fall of the cost that it promises."""
-    part, free, white = fit.part, fit.free, fit.white
-    pulls = white.columns.T @ white.residual + part.prior.pull(fit.state, free)
+    path, free, white = fit.path, fit.free, fit.white
+    pulls = white.columns.T @ white.residual + path.prior.pull(fit.state, free)
     moving = [
         index
         for index in fit.smooth
@@ -366,51 +373,51 @@ def _solve(fit: PartFit, damping: float) -> tuple[list[Free], list[float], float
     return [free[index] for index in moving], step.tolist(), float(step @ pulls[moving])
 
 
-def _is_pushed_out(state: State, number: Free, pull: float) -> bool:
+def _is_pushed_out(state: ModelState, number: Free, pull: float) -> bool:
     """Whether a number is at a bound and is pulled beyond it."""
     value, (low, high) = state.get(number), number.bounds
     return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
 
 
-def _walk_grid(fit: PartFit, number: Free, *, exact: bool) -> PartFit:
+def _walk_grid(fit: PathFit, number: Free, *, exact: bool) -> PathFit:
     """Search a number on ever finer grids, the others adapted linearly; then all of them are fitted."""
-    part, noise, smooth = fit.part, fit.noise, fit.smooth
+    path, noise, smooth = fit.path, fit.noise, fit.smooth
     columns = pick_columns(fit.columns, smooth)
     value = fit.state.get(number)
-    best, least = value, measure_cost(part, noise, fit.state, fit.free, fit.residual)
+    best, least = value, measure_cost(path, noise, fit.state, fit.free, fit.residual)
     inverse = invert(fit.normal[np.ix_(smooth, smooth)])
     for spacing, count in _GRID:
         values = best + spacing * number.step * np.arange(-count, count + 1)
         for at in np.delete(values, count).tolist():
             if not number.bounds[0] <= at <= number.bounds[1]:
                 continue
-            residual = part.find_residuals(fit.state.set(number, at))
+            residual = path.find_residuals(fit.state.set(number, at))
             if smooth:
-                white = whiten(part, noise, residual, columns)
+                white = whiten(path, noise, residual, columns)
                 residual = residual - combine_columns(columns, inverse @ (white.columns.T @ white.residual))
-            cost = measure_cost(part, noise, fit.state, fit.free, residual)
+            cost = measure_cost(path, noise, fit.state, fit.free, residual)
             # Values between which no command lies are alike but for rounding.
             if cost < least - _ENOUGH:
                 best, least = at, cost
     if best == value:
         return fit
     state = fit.state.set(number, best)
-    residual = part.find_residuals(state)
+    residual = path.find_residuals(state)
     moved = replace(
-        fit, state=state, residual=residual, columns=part.differentiate(state, residual, fit.free)
+        fit, state=state, residual=residual, columns=path.differentiate(state, residual, fit.free)
     )
     beyond = _descend(moved, exact=exact)
     return beyond if beyond.score < fit.score else fit
 
 
-def make_folds(part: Part) -> Ints:
+def make_folds(path: PathResiduals) -> Ints:
     """Fold of each step: of runs where there are some, else of blocks, shape (n,)."""
-    label = part.run if int(part.run.max(initial=0)) + 1 >= _FEWEST_HELD else part.block
+    label = path.run if int(path.run.max(initial=0)) + 1 >= _FEWEST_HELD else path.block
     number: Ints = np.unique(label, return_inverse=True)[1] % FOLDS
     return number
 
 
-def hold_out(fit: PartFit, noise: Noise, folds: Ints) -> Floats:
+def hold_out(fit: PathFit, noise: Noise, folds: Ints) -> Floats:
     """Residuals of every step under numbers fitted without its fold, by one step from the fit, shape (n, 3).
 
     Args:
@@ -422,7 +429,7 @@ def hold_out(fit: PartFit, noise: Noise, folds: Ints) -> Floats:
     if not smooth:
         return held
     columns = pick_columns(fit.columns, smooth)
-    white = whiten(fit.part, noise, fit.residual, columns)
+    white = whiten(fit.path, noise, fit.residual, columns)
     normal, pull = white.columns.T @ white.columns, white.columns.T @ white.residual
     own = 0.01 * np.diag(np.diag(normal))
     fold_of_row = folds[white.rows]

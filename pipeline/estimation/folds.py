@@ -13,10 +13,10 @@ from pipeline.core import (
     Floats,
     Ints,
 )
-from pipeline.estimation.fit import PartFit, invert
+from pipeline.estimation.fit import PathFit, invert
 
 if TYPE_CHECKING:
-    from pipeline.estimation.state import State
+    from pipeline.estimation.model_state import ModelState
     from pipeline.estimation.window_residuals import WindowResiduals
 
 # Blocked cross-validation: ten-second stretches are tested with parameters fitted without them.
@@ -39,7 +39,7 @@ class Fold:
 
 
 class _Rows(Protocol):
-    """Rows with a run and times: windows, or the steps of a part."""
+    """Rows with a run and times: windows, or the steps of a path."""
 
     run: Ints
     times: Floats
@@ -70,7 +70,7 @@ def find_near(rows: _Rows, held: _Rows, test: Flags) -> Flags:
     return near
 
 
-def refit(fit: PartFit, train: Flags) -> State:
+def refit(fit: PathFit, train: Flags) -> ModelState:
     """State of the fit on some steps only, by one step from its solution with its own derivatives.
 
     Args:
@@ -84,7 +84,7 @@ def refit(fit: PartFit, train: Flags) -> State:
     columns = white.columns[:, smooth]
     own = _LEAST_SHARE * np.diag(np.einsum("ij,ij->j", columns, columns))
     free = [fit.free[index] for index in smooth]
-    prior = fit.part.prior
+    prior = fit.path.prior
     rows = train[white.rows]
     normal = columns[rows].T @ columns[rows] + own + np.diag(prior.weigh(state, fit.free)[smooth])
     pull = columns[rows].T @ white.residual[rows] + prior.pull(state, fit.free)[smooth]

@@ -10,14 +10,14 @@ import numpy as np
 
 from pipeline.core import NORMAL_95
 from pipeline.estimation.fit import invert, join_covariance, measure_cost, whiten_columns
-from pipeline.estimation.parts import CLOCK_STEP_S
+from pipeline.estimation.path_residuals import CLOCK_STEP_S
 from pipeline.models import cut_interval, stands_at_bound
 
 if TYPE_CHECKING:
     from pipeline.core import Floats
-    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.fit import PathFit
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.estimation.state import Free
+    from pipeline.estimation.model_state import Free
 
 _RISEN = 3.84
 """Rise of chi-square at the ends of a 95 % interval."""
@@ -138,7 +138,7 @@ def estimate_intervals(fitted: Fitted) -> Estimates:
     Args:
         fitted: a converged fit.
     """
-    made = [estimate_part(fit) for fit in fitted.fits if fit.free]
+    made = [estimate_path(fit) for fit in fitted.fits if fit.free]
     if not made:
         return NOTHING
     sizes = [len(one.items) for one in made]
@@ -149,9 +149,9 @@ def estimate_intervals(fitted: Fitted) -> Estimates:
     return Estimates(items, correlation, min(one.blocks for one in made))
 
 
-def estimate_part(fit: PartFit) -> Estimates:
-    """Intervals of the free parameters of one part, with the other parts unchanged."""
-    count, part = len(fit.free), fit.part
+def estimate_path(fit: PathFit) -> Estimates:
+    """Intervals of the free parameters of one path, with the other paths unchanged."""
+    count, path = len(fit.free), fit.path
     information = np.diag(fit.normal)
     observable = information > _SMALLEST**2 * float(information.max(initial=0.0))
     known = _bound_information(fit)
@@ -171,64 +171,64 @@ def estimate_part(fit: PartFit) -> Estimates:
             float(errors[index]),
             at_bound=stands_at_bound(value, fit.state.find_bounds(number)),
             observable=bool(observable[index]),
-            clock_error=math.sqrt(float(carried[index])) if part.dates_poses else 0.0,
+            clock_error=math.sqrt(float(carried[index])) if path.dates_poses else 0.0,
         )
         for index, number in enumerate(fit.free)
     ]
-    return Estimates(tuple(items), correlation if count else np.zeros((0, 0)), int(part.block.max()) + 1)
+    return Estimates(tuple(items), correlation if count else np.zeros((0, 0)), int(path.block.max()) + 1)
 
 
-def _bound_information(fit: PartFit) -> Floats:
+def _bound_information(fit: PathFit) -> Floats:
     """Information on the numbers (p, p), each known to be within its bounds."""
     # Without it a poorly determined parameter moves far beyond its range and takes correlated ones along.
     ranges = np.array([np.subtract(*number.bounds) for number in fit.free])
     return np.asarray(fit.normal + np.diag(1.0 / ranges**2))
 
 
-def find_covariance(fit: PartFit) -> Floats:
+def find_covariance(fit: PathFit) -> Floats:
     """Covariance of the numbers of a fit with the errors of clocks and lengths, shape (p, p)."""
     known = _bound_information(fit)
     return join_covariance(fit, known) + np.diag(carry_clocks(fit, known) + carry_lengths(fit, known))
 
 
-def _find_width(fit: PartFit, number: Free) -> float:
+def _find_width(fit: PathFit, number: Free) -> float:
     """Half of the interval of a number that is not smooth, by the likelihood on either side of it."""
-    value, (low, high), part = fit.state.get(number), number.bounds, fit.part
-    least = measure_cost(part, fit.noise, fit.state, fit.free, fit.residual) + _RISEN * fit.overdispersion
+    value, (low, high), path = fit.state.get(number), number.bounds, fit.path
+    least = measure_cost(path, fit.noise, fit.state, fit.free, fit.residual) + _RISEN * fit.overdispersion
     widths = []
     for side, room in ((-1.0, value - low), (1.0, high - value)):
         width, most = number.step / 16.0, min(64.0 * number.step, room)
         while width < most:
             moved = fit.state.set(number, value + side * width)
-            if measure_cost(part, fit.noise, moved, fit.free, part.find_residuals(moved)) > least:
+            if measure_cost(path, fit.noise, moved, fit.free, path.find_residuals(moved)) > least:
                 break
             width *= 1.5
         widths.append(min(width, most))
     return max(widths)
 
 
-def carry_clocks(fit: PartFit, information: Floats) -> Floats:
+def carry_clocks(fit: PathFit, information: Floats) -> Floats:
     """Variance of each number by clocks that the fit takes as given, shape (p,)."""
-    part, carried = fit.part, np.zeros(len(fit.free))
-    for run, error in enumerate(part.list_clock_errors().tolist()):
+    path, carried = fit.path, np.zeros(len(fit.free))
+    for run, error in enumerate(path.list_clock_errors().tolist()):
         if error == 0.0:
             continue
-        mine, change = part.run == run, np.zeros((*fit.residual.shape, 1))
-        late = part.shift_clock(fit.state, run, CLOCK_STEP_S) - fit.residual[mine]
+        mine, change = path.run == run, np.zeros((*fit.residual.shape, 1))
+        late = path.shift_clock(fit.state, run, CLOCK_STEP_S) - fit.residual[mine]
         change[mine, :, 0] = -error * late / CLOCK_STEP_S
         carried += _carry(fit, information, change)
     return carried
 
 
-def carry_lengths(fit: PartFit, information: Floats) -> Floats:
+def carry_lengths(fit: PathFit, information: Floats) -> Floats:
     """Variance of each number by dimensions of the vehicle that were estimated from the log, shape (p,)."""
-    shifts = fit.part.list_length_shifts(fit.state)
+    shifts = fit.path.list_length_shifts(fit.state)
     return np.asarray(
         sum((_carry(fit, information, shift[:, :, None]) for shift in shifts), np.zeros(len(fit.free)))
     )
 
 
-def _carry(fit: PartFit, information: Floats, change: Floats) -> Floats:
+def _carry(fit: PathFit, information: Floats, change: Floats) -> Floats:
     """Variance of each number by one that the fit takes as given, shape (p,).
 
     Args:
@@ -240,16 +240,16 @@ def _carry(fit: PartFit, information: Floats, change: Floats) -> Floats:
     return np.asarray((invert(information) @ (fit.white.columns.T @ white)) ** 2)
 
 
-def narrow_part(fit: PartFit) -> tuple[Floats, Floats]:
-    """Widths of intervals after the first blocks, which end at those of `estimate_part`.
+def narrow_path(fit: PathFit) -> tuple[Floats, Floats]:
+    """Widths of intervals after the first blocks, which end at those of `estimate_path`.
 
     Returns:
         Seconds of steps until the end of each block, shape (k,), and half-widths of the 95 % interval of each
         free parameter, infinite where it is not observable yet, shape (k, p).
     """
-    part, white = fit.part, fit.white
-    last = np.array([item.half for item in estimate_part(fit).items])
-    label, count = part.block[white.rows], int(part.block.max()) + 1
+    path, white = fit.path, fit.white
+    last = np.array([item.half for item in estimate_path(fit).items])
+    label, count = path.block[white.rows], int(path.block.max()) + 1
     normals = np.zeros((count, len(fit.free), len(fit.free)))
     # Steps, and so their blocks, are in order.
     ends = np.searchsorted(label, np.arange(1, count))
@@ -259,5 +259,5 @@ def narrow_part(fit: PartFit) -> tuple[Floats, Floats]:
     errors = np.array([np.sqrt(np.diag(invert(one))) for one in known])
     halves = last * errors / np.maximum(errors[-1], 1e-300)
     observable = np.einsum("kii->ki", known) > _SMALLEST * np.diag(known[-1])
-    seconds = np.cumsum(np.bincount(part.block, part.spans, minlength=count))
+    seconds = np.cumsum(np.bincount(path.block, path.spans, minlength=count))
     return np.asarray(seconds, dtype=np.float64), np.where(observable, halves, math.inf)

@@ -12,11 +12,11 @@ import numpy as np
 
 from pipeline.core import JSON_DIGITS, Floats, finite_or_none, pick
 from pipeline.estimation.errors import Errors, errors_as_json, measure_errors
+from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import HeldOut, hold_out
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import Problem
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
 from pipeline.models import Model, ModelFile, Timing
@@ -51,7 +51,7 @@ class LadderStep:
     def drop(self, name: str) -> LadderStep:
         """The model without one effect, refitted."""
         rest = [one for one in self.effects if one != name]
-        return fit_step(self.fitted.problem, self.fitted, rest)
+        return fit_step(self.fitted.data, self.fitted, rest)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def find_share_removed(error: float, ideal: float, floor: float) -> float | None
     return (ideal - error) / room if room > _LEAST_ROOM * ideal else None
 
 
-def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Ladder:
+def climb(data: EstimationData, model: Model, *, per_run: Sequence[str] = ()) -> Ladder:
     """Build the ladder of a model's effects, that effect next which most lowers the errors over 2 s.
 
     All effects are fitted together. Errors with one more are predicted with the values of that fit; of
@@ -99,57 +99,57 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     error is also a step: `list_rises` reports it.
 
     Args:
-        problem: the runs.
+        data: the runs.
         model: model with the effects, whose values are the starts.
         per_run: as in `fit_model`.
     """
-    return _climb_to(judge_whole(problem, model, per_run), per_run)
+    return _climb_to(judge_whole(data, model, per_run), per_run)
 
 
 def _climb_to(whole: LadderStep, per_run: Sequence[str]) -> Ladder:
     """The ladder up to a judged model: each step is what the model with only these effects is elsewhere."""
-    problem, model = whole.fitted.problem, whole.fitted.model
+    data, model = whole.fitted.data, whole.fitted.model
     steps, taken = list[LadderStep](), list[str]()
     while len(taken) < len(whole.effects):
-        steps.append(judge_whole(problem, model.keep(taken), per_run))
-        taken.append(_choose_next(problem, whole.fitted, taken, steps[0].errors))
+        steps.append(judge_whole(data, model.keep(taken), per_run))
+        taken.append(_choose_next(data, whole.fitted, taken, steps[0].errors))
     return Ladder((*steps, whole))
 
 
-def _choose_next(problem: Problem, whole: Fitted, taken: Sequence[str], ideal: Errors) -> str:
+def _choose_next(data: EstimationData, whole: Fitted, taken: Sequence[str], ideal: Errors) -> str:
     """The effect of a fit, beside those already taken, with the lowest predicted error."""
     first, *others = (name for name in whole.model.ids if name not in taken)
     if not others:
         return first
-    errors = {name: _predict_error(problem, whole, [*taken, name], ideal) for name in (first, *others)}
+    errors = {name: _predict_error(data, whole, [*taken, name], ideal) for name in (first, *others)}
     least = min(errors.values())
     return next((name for name, error in errors.items() if error <= least + CHANCE), first)
 
 
-def judge_whole(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> LadderStep:
+def judge_whole(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> LadderStep:
     """The exact fit of a model's effects that act on the input, with its held-out errors.
 
     Whatever is said of a model's error on these runs is this; from the same values, it is the same to the
     last digit.
     """
-    active = model.keep(effect.id for effect in problem.active_effects(model))
-    fitted = fit_model(problem, active, per_run=per_run, exact=True)
-    return LadderStep(fitted, hold_out(problem, fitted))
+    active = model.keep(effect.id for effect in data.active_effects(model))
+    fitted = fit_model(data, active, per_run=per_run, exact=True)
+    return LadderStep(fitted, hold_out(data, fitted))
 
 
-def _predict_error(problem: Problem, whole: Fitted, names: Sequence[str], ideal: Errors) -> float:
+def _predict_error(data: EstimationData, whole: Fitted, names: Sequence[str], ideal: Errors) -> float:
     """Sum of both errors over 2 s with some effects of a fit, relative to those of the ideal model.
 
     Where nothing can be predicted over 2 s, it is that of the velocities' errors.
     """
     state = whole.state.drop(set(whole.model.ids) - set(names))
     horizons = [
-        comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
-        for run, comparison in enumerate(problem.comparisons)
+        run_residuals.find_horizon_errors(state.effects_of(run), state.timing[run])
+        for run, run_residuals in enumerate(data.residuals_by_run)
     ]
     position, yaw = (np.concatenate([getattr(one, name) for one in horizons]) for name in ("position", "yaw"))
     is_known = np.isfinite(position).any()
-    residuals = np.empty((0, 3)) if is_known else problem.find_residuals(state)
+    residuals = np.empty((0, 3)) if is_known else data.find_residuals(state)
     ratios = measure_errors(residuals, position, yaw).ratios(ideal)
     return sum(ratios[3:] if is_known else ratios[:3])
 
@@ -160,14 +160,14 @@ def list_order(steps: Sequence[LadderStep]) -> list[str]:
 
 
 def fit_step(
-    problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()
+    data: EstimationData, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()
 ) -> LadderStep:
     """The model with some of its effects, fitted from the whole model as far as a comparison needs it."""
     if not names:
         # It has only delays: they are estimated as elsewhere, not from those of the whole model.
-        return judge_whole(problem, whole.model.ideal)
-    fitted = fit_model(problem, whole.model.keep(names), per_run=per_run, start=whole)
-    return LadderStep(fitted, hold_out(problem, fitted))
+        return judge_whole(data, whole.model.ideal)
+    fitted = fit_model(data, whole.model.keep(names), per_run=per_run, start=whole)
+    return LadderStep(fitted, hold_out(data, fitted))
 
 
 def raises_errors(below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object]) -> bool:
@@ -201,11 +201,11 @@ def _mean_squares(residuals: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class ModelAssessment:
     """Fit, ladder and estimates of a model on runs.
 
     Attributes:
-        problem: the runs.
+        data: the runs.
         physics: all effects of the model, fitted together, with their held-out errors.
         estimates: its parameters with intervals.
         per_run: labels with one value per run.
@@ -213,7 +213,7 @@ class Judgement:
         suggested: the effects with a suggested formula; None without one.
     """
 
-    problem: Problem
+    data: EstimationData
     physics: LadderStep
     estimates: Estimates
     per_run: tuple[str, ...] = ()
@@ -228,7 +228,7 @@ class Judgement:
     @cached_property
     def ideal(self) -> LadderStep:
         """The ideal model."""
-        return judge_whole(self.problem, self.physics.fitted.model.ideal)
+        return judge_whole(self.data, self.physics.fitted.model.ideal)
 
     @cached_property
     def ladder(self) -> Ladder:
@@ -244,50 +244,50 @@ class Judgement:
     @cached_property
     def floor(self) -> Errors:
         """The noise floor of the runs, by what the physics leaves, and a suggested formula."""
-        return estimate_floor(self.problem, (self.suggested or self.physics).fitted.state)
+        return estimate_floor(self.data, (self.suggested or self.physics).fitted.state)
 
 
-def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:
+def assess_model(data: EstimationData, model: Model, *, per_run: Sequence[str] = ()) -> ModelAssessment:
     """Fit a model.
 
     Args:
-        problem: the runs.
+        data: the runs.
         model: its effects at neutral values are searched, others start from their values.
         per_run: labels with one value per run.
     """
-    whole = judge_whole(problem, model, per_run)
-    return Judgement(problem, whole, estimate_intervals(whole.fitted), tuple(per_run))
+    whole = judge_whole(data, model, per_run)
+    return ModelAssessment(data, whole, estimate_intervals(whole.fitted), tuple(per_run))
 
 
-def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
+def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     """The model file with fitted values, intervals, and the data of the fit.
 
     Effects that do not act on the input keep their values.
     """
-    fitted = judgement.fitted.model
+    fitted = assessment.fitted.model
     model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
     intervals = {
         label: interval
         for label, interval in file.intervals.items()
         if not any(label.startswith(f"{effect.id}.") for effect in fitted)
     }
-    problem, estimates = judgement.problem, judgement.estimates
+    data, estimates = assessment.data, assessment.estimates
     intervals |= estimates.shared_intervals
     fit: dict[str, object] = {
-        "input": problem.source.value,
+        "input": data.source.value,
         "blocks": estimates.blocks,
-        "noise_floor": errors_as_json(judgement.floor),
+        "noise_floor": errors_as_json(assessment.floor),
         "runs": [
             {
-                "run": comparison.run.name,
-                "sha256": comparison.run.sha256,
-                "terrain": comparison.run.terrain,
-                "pose_delay_s": comparison.run.alignment.heading_delay_s,
+                "run": run_residuals.run.name,
+                "sha256": run_residuals.run.sha256,
+                "terrain": run_residuals.run.terrain,
+                "pose_delay_s": run_residuals.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
                 **driven,
             }
-            for comparison, timing, driven in zip(
-                problem.comparisons, judgement.fitted.state.timing, _measure_driven(problem), strict=True
+            for run_residuals, timing, driven in zip(
+                data.residuals_by_run, assessment.fitted.state.timing, _measure_driven(data), strict=True
             )
         ],
         "ladder": [
@@ -297,41 +297,41 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
                 "t_mrmse_m": step.errors.t_mrmse_m,
                 "r_mrmse_rad": step.errors.r_mrmse_rad,
             }
-            for step in judgement.ladder.steps
+            for step in assessment.ladder.steps
         ],
     }
     own = [
         {
-            "run": problem.names[run],
+            "run": data.names[run],
             "parameter": item.free.label,
             **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
         }
-        for run in range(len(problem.names))
+        for run in range(len(data.names))
         for item in estimates.items
         if item.free.effect and run in item.free.runs
     ]
     if own:
         fit["own"] = own
-    per_run = tuple(dict.fromkeys((*file.per_run, *judgement.fitted.per_run)))
+    per_run = tuple(dict.fromkeys((*file.per_run, *assessment.fitted.per_run)))
     # Other runs may distinguish effects that those of the diagnosis could not.
     names = [run["run"] for run in file.list_fitted("runs")]
-    if names in ([], list(problem.names)):
+    if names in ([], list(data.names)):
         ids = set(model.ids)
         undecided = [group for group in file.undecided if ids.intersection(group)]
         fit |= {key: rows for key, rows in (("undecided", undecided),) if rows}
     return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)
 
 
-def _measure_driven(problem: Problem) -> list[dict[str, float]]:
+def _measure_driven(data: EstimationData) -> list[dict[str, float]]:
     """Driven speed and yaw rate of each run over windows of half a second: the 99th percentile.
 
     Of the speed also the lower quartile of the windows in which it drives.
     """
-    part, driven = problem.whole, []
-    for run, comparison in enumerate(problem.comparisons):
-        velocity = comparison.predict_velocity((), Timing())
-        ideal = average_windows(comparison, velocity, locate_windows(comparison))
-        measured = np.abs(part.find_run_residuals(problem.start_state(), run) + ideal)
+    windows, driven = data.whole, []
+    for run, run_residuals in enumerate(data.residuals_by_run):
+        velocity = run_residuals.predict_velocity((), Timing())
+        ideal = average_windows(run_residuals, velocity, locate_windows(run_residuals))
+        measured = np.abs(windows.find_run_residuals(data.start_state(), run) + ideal)
         speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
         moving = measured[:, 0][measured[:, 0] > STILL_MPS]
         lower = {LOWER_SPEED: round(float(np.quantile(moving, 0.25)), 4)} if moving.size else {}

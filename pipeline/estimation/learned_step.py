@@ -16,14 +16,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.core import FOLDS, Flags, Floats, Ints, format_share, robust_spreads
-from pipeline.estimation.comparison import Input
 from pipeline.estimation.errors import Errors
+from pipeline.estimation.estimation_data import FEWEST_WINDOWS, EstimationData
 from pipeline.estimation.evidence import regress
 from pipeline.estimation.held_out import HeldOut, find_in_test, hold_out, number_predictions, score
-from pipeline.estimation.ladder import Judgement, LadderStep, find_share_removed, judge_whole
+from pipeline.estimation.ladder import LadderStep, ModelAssessment, find_share_removed, judge_whole
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
-from pipeline.estimation.state import State
+from pipeline.estimation.model_state import ModelState
+from pipeline.estimation.run_residuals import Input
 from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.estimation.window_residuals import CLIP
 from pipeline.models import (
@@ -69,12 +69,12 @@ class ResidualData:
     """Residuals of a model and the inputs of a learned term.
 
     Attributes:
-        problem: the runs.
+        data: the runs.
         state: the model with its values.
     """
 
-    problem: Problem
-    state: State
+    data: EstimationData
+    state: ModelState
 
     @cached_property
     def windows(self) -> tuple[Floats, Floats, Flags]:
@@ -82,11 +82,11 @@ class ResidualData:
         from pipeline.estimation.rivals import average_features  # noqa: PLC0415 - only where a term is learned
 
         known, residuals, whole = list[Floats](), list[Floats](), list[Flags]()
-        for run, comparison in enumerate(self.problem.comparisons):
+        for run, run_residuals in enumerate(self.data.residuals_by_run):
             probe = InputProbe()
             effects = (*self.state.effects_of(run), probe)
-            residuals.append(comparison.find_residuals(effects, self.state.timing[run], restarted=True))
-            mean, inside = average_features(comparison, probe.known)
+            residuals.append(run_residuals.find_residuals(effects, self.state.timing[run], restarted=True))
+            mean, inside = average_features(run_residuals, probe.known)
             known.append(mean)
             whole.append(inside)
         return np.concatenate(known), np.concatenate(residuals), np.concatenate(whole)
@@ -97,7 +97,7 @@ class ResidualData:
         rows = rows & whole
         if rows.sum() < FEWEST_WINDOWS:
             return ResidualTerm()
-        inputs, residuals, unit = inputs[rows], residuals[rows], self.problem.whole.unit[rows]
+        inputs, residuals, unit = inputs[rows], residuals[rows], self.data.whole.unit[rows]
         most = CLIP * np.maximum(robust_spreads(residuals), 1e-9)
         targets = np.clip(residuals, -most, most)
         scale = np.sqrt((inputs**2).mean(axis=0))
@@ -128,21 +128,21 @@ class ResidualData:
         Returns:
             The errors of both, and the stretch of each prediction of all runs.
         """
-        problem, state = self.problem, self.state
-        before = score(problem, state)
+        data, state = self.data, self.state
+        before = score(data, state)
         shapes = [errors.shape for errors in before.position]
         position, yaw = ([np.full(shape, np.nan) for shape in shapes] for _ in range(2))
         seen = [np.zeros(shape, dtype=bool) for shape in shapes]
-        for fold in problem.folds:
+        for fold in data.folds:
             test = fold.test & rows
             if not test.any():
                 continue
             term = self.learn(rows & fold.train)
-            for run, comparison in enumerate(problem.comparisons):
-                mine = problem.whole.run == run
-                in_test = find_in_test(comparison, problem.whole.times[mine], test[mine])
+            for run, run_residuals in enumerate(data.residuals_by_run):
+                mine = data.whole.run == run
+                in_test = find_in_test(run_residuals, data.whole.times[mine], test[mine])
                 if in_test.any():
-                    held_errors = comparison.find_horizon_errors(
+                    held_errors = run_residuals.find_horizon_errors(
                         (*state.effects_of(run), term), state.timing[run]
                     )
                     position[run][in_test], yaw[run][in_test] = (
@@ -155,7 +155,7 @@ class ResidualData:
         )
         turned = tuple(np.where(one, errors, np.nan) for one, errors in zip(seen, before.yaw, strict=True))
         after = replace(before, position=tuple(position), yaw=tuple(yaw))
-        stretches = np.concatenate(number_predictions(problem))
+        stretches = np.concatenate(number_predictions(data))
         return replace(before, position=known, yaw=turned), after, stretches
 
 
@@ -237,64 +237,66 @@ class LearnedStep:
         return shares
 
 
-def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedStep:
+def make_learned_step(data: EstimationData, fitted: Fitted, below: HeldOut) -> LearnedStep:
     """Learn the residual of a fitted model, and score both on held-out stretches.
 
     Args:
-        problem: the runs.
+        data: the runs.
         fitted: the model without a learned term.
         below: its held-out errors.
     """
-    data = ResidualData(problem, fitted.state)
-    term = data.learn(np.ones(problem.whole.run.size, dtype=bool))
+    residual_data = ResidualData(data, fitted.state)
+    term = residual_data.learn(np.ones(data.whole.run.size, dtype=bool))
     if not term.inputs:
         return LearnedStep(term, below, below, "no input explains the residual")
     from pipeline.estimation.across_runs import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
 
-    above = hold_out(problem, fitted, learn_fold(problem))
-    refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
+    above = hold_out(data, fitted, learn_fold(data))
+    refusal = explain_no_help(below, above, np.concatenate(number_predictions(data)))
     state = fitted.state.add(term)
-    bands = make_bands(list_ratios(problem, state, above), _name_own(problem))
-    if not refusal and (apart := leave_grounds_out(problem, fitted.model, fitted.per_run)) is not None:
+    bands = make_bands(list_ratios(data, state, above), _name_own(data))
+    if not refusal and (apart := leave_grounds_out(data, fitted.model, fitted.per_run)) is not None:
         bands, refusal = apart.bands, apart.refusal
     return LearnedStep(ResidualTerm(term.inputs, bands), below, above, refusal)
 
 
-def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, HeldOut]:
+def fit_and_hold_out(
+    data: EstimationData, model: Model, per_run: Sequence[str] = ()
+) -> tuple[Fitted, HeldOut]:
     """Fit the physics of a model, retrain its learned term if it has one, and score both together."""
-    physics = judge_whole(problem, drop_learned(model), per_run)
+    physics = judge_whole(data, drop_learned(model), per_run)
     fitted, below = physics.fitted, physics.held_out
     if find_learned(model) is None:
         return fitted, below
-    step = make_learned_step(problem, fitted, below)
+    step = make_learned_step(data, fitted, below)
     return add_term(fitted, step.term), step.held_out
 
 
-def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
+def judge_with_term(data: EstimationData, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
     """As `judge_rival`, for a model that may have a learned term, which is retrained."""
     from pipeline.estimation.rivals import Rival, judge_fit, time_fit  # noqa: PLC0415 - only where a term is learned
 
-    fitted, fit_s = time_fit(problem, drop_learned(model), per_run)
-    physics = judge_fit(problem, name, fitted, fit_s)
+    fitted, fit_s = time_fit(data, drop_learned(model), per_run)
+    physics = judge_fit(data, name, fitted, fit_s)
     if find_learned(model) is None:
         return physics
     start_s = time.process_time()
-    term = ResidualData(problem, fitted.state).learn(np.ones(problem.whole.run.size, dtype=bool))
+    term = ResidualData(data, fitted.state).learn(np.ones(data.whole.run.size, dtype=bool))
     learned_s = time.process_time() - start_s
     numbers = (physics.numbers or 0) + _count_numbers(term)
-    return Rival(name, numbers, hold_out(problem, fitted, learn_fold(problem)), fit_s + learned_s)
+    return Rival(name, numbers, hold_out(data, fitted, learn_fold(data)), fit_s + learned_s)
 
 
 def _count_numbers(term: ResidualTerm) -> int:
     return sum(bool(add) for one in term.inputs for add in one.adds)
 
 
-def judge_learned_term(judgement: Judgement) -> Judgement:
-    """The judgement of a model without a learned term, with one added."""
-    below = judgement.whole
-    step = make_learned_step(judgement.problem, below.fitted, below.held_out)
+def judge_learned_term(assessment: ModelAssessment) -> ModelAssessment:
+    """The assessment of a model without a learned term, with one added."""
+    below = assessment.whole
+    step = make_learned_step(assessment.data, below.fitted, below.held_out)
     last = LadderStep(add_term(below.fitted, step.term), step.held_out)
-    return replace(judgement, learned=last)
+    return replace(assessment, learned=last)
 
 
 def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
@@ -303,29 +305,33 @@ def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
     return replace(fitted, state=state)
 
 
-def _name_own(problem: Problem) -> str:
-    return "of this run only" if len(problem.runs) == 1 else "of these runs only"
+def _name_own(data: EstimationData) -> str:
+    return "of this run only" if len(data.runs) == 1 else "of these runs only"
 
 
-Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
+Learn = Callable[[ModelState, Flags], Callable[[int], Sequence[Effect]]]
 
 
-def learn_fold(problem: Problem) -> Learn:
+def learn_fold(data: EstimationData) -> Learn:
     """Learned term retrained without the tested stretches, as `hold_out` requires."""
 
-    def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
-        term = ResidualData(problem, state).learn(rows)
+    def learn(state: ModelState, rows: Flags) -> Callable[[int], Sequence[Effect]]:
+        term = ResidualData(data, state).learn(rows)
         return lambda _run: (term,)
 
     return learn
 
 
-def learn_where_it_helps(problem: Problem) -> Learn:
+def learn_where_it_helps(data: EstimationData) -> Learn:
     """As `learn_fold`, with a term used only if it helps on the training data: the choice is held out."""
 
-    def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
-        data = ResidualData(problem, state)
-        term = ResidualTerm() if explain_no_help(*data.cross_validate(rows)) else data.learn(rows)
+    def learn(state: ModelState, rows: Flags) -> Callable[[int], Sequence[Effect]]:
+        residual_data = ResidualData(data, state)
+        term = (
+            ResidualTerm()
+            if explain_no_help(*residual_data.cross_validate(rows))
+            else residual_data.learn(rows)
+        )
         return lambda _run: (term,)
 
     return learn
@@ -344,15 +350,15 @@ class GroundsOut:
     refusal: str
 
 
-def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> GroundsOut | None:
+def leave_grounds_out(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> GroundsOut | None:
     """Learn without each ground in turn, and score on that ground; None if all runs are on one ground.
 
     Args:
-        problem: the runs.
+        data: the runs.
         model: the physics, refitted without each ground.
         per_run: as in `fit_model`; such parameters are fitted on the left-out ground, too.
     """
-    grounds = sorted({run.terrain for run in problem.runs})
+    grounds = sorted({run.terrain for run in data.runs})
     if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
         return None
     from pipeline.estimation.across_runs import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
@@ -360,12 +366,12 @@ def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = (
     ratios: list[Ratios] = []
     refusals: list[str] = []
     for ground in grounds:
-        rest = _take(problem, [run for run in problem.runs if run.terrain != ground])
+        rest = _take(data, [run for run in data.runs if run.terrain != ground])
         fitted = fit_model(rest, model, per_run=per_run)
         term = ResidualData(rest, fitted.state).learn(np.ones(rest.whole.run.size, dtype=bool))
-        for run in problem.runs:
+        for run in data.runs:
             if run.terrain == ground:
-                there = _take(problem, [run])
+                there = _take(data, [run])
                 state = fit_own(there, fitted.model, per_run).state
                 before, after = (score(there, one) for one in (state, state.add(term)))
                 ratios += list_ratios(there, state, after)
@@ -375,8 +381,8 @@ def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = (
     return GroundsOut(bands, "; ".join(refusals))
 
 
-def _take(problem: Problem, runs: Sequence[MotionRun]) -> Problem:
-    return Problem(runs, problem.vehicle, problem.source, heading=problem.heading)
+def _take(data: EstimationData, runs: Sequence[MotionRun]) -> EstimationData:
+    return EstimationData(runs, data.vehicle, data.source, heading=data.heading)
 
 
 def check_bands(
@@ -397,30 +403,30 @@ def check_bands(
     from pipeline.estimation.across_runs import list_ratios, measure_coverage  # noqa: PLC0415 - only where a term is learned
 
     for run in runs:
-        there = Problem([run], model.vehicle, source)
+        there = EstimationData([run], model.vehicle, source)
         state = fit_own(there, model, per_run).state
         coverages.append(measure_coverage(term.bands, list_ratios(there, state, score(there, state))))
     return coverages
 
 
-def fit_own(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:
+def fit_own(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> Fitted:
     """A model on runs that it was not fitted on: only clocks and parameters of single runs are fitted."""
     clocks = [f"{one.id}.{name}" for one in model if one.late is Late.POSES for name in one.values]
-    return fit_as_it_is(problem, model, (*clocks, *per_run))
+    return fit_as_it_is(data, model, (*clocks, *per_run))
 
 
-def learn_beyond(judgement: Judgement) -> LearnedStep | None:
+def learn_beyond(assessment: ModelAssessment) -> LearnedStep | None:
     """A learned term on top of a judged model; None if it has one already.
 
     Nothing is learned from an error at the noise floor.
     """
-    below, floor = judgement.whole, judgement.floor
+    below, floor = assessment.whole, assessment.floor
     if find_learned(below.fitted.model) is not None:
         return None
     if all(read_error(below.errors, one) < ABOVE_FLOOR * read_error(floor, one) for one in ERRORS_OVER_2S):
         at_floor = "the remaining error is at the noise floor"
         return LearnedStep(ResidualTerm(), below.held_out, below.held_out, at_floor)
-    return make_learned_step(judgement.problem, below.fitted, below.held_out)
+    return make_learned_step(assessment.data, below.fitted, below.held_out)
 
 
 def summarize_learned(step: LearnedStep, ideal: Errors, floor: Errors) -> Learned:

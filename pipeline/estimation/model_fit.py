@@ -1,4 +1,4 @@
-"""A model fitted to runs, part by part from the commands to the motion."""
+"""A model fitted to runs, path by path from the commands to the motion."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 from pipeline.estimation.candidates import Screen, Unset
-from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.fit import PathFit, fit_path
 from pipeline.models import Model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.core import Floats
-    from pipeline.estimation.parts import Part
-    from pipeline.estimation.problem import Problem
-    from pipeline.estimation.state import Free, State
+    from pipeline.estimation.estimation_data import EstimationData
+    from pipeline.estimation.model_state import Free, ModelState
+    from pipeline.estimation.path_residuals import PathResiduals
 
 
 @dataclass(frozen=True)
@@ -24,24 +24,24 @@ class Fitted:
     """A model fitted to runs.
 
     Attributes:
-        problem: the runs.
+        data: the runs.
         state: model, per-run values and delays.
-        fits: the fit of each part of the path.
+        fits: the fit of each path.
     """
 
-    problem: Problem = field(repr=False)
-    state: State
-    fits: tuple[PartFit, ...] = field(repr=False)
+    data: EstimationData = field(repr=False)
+    state: ModelState
+    fits: tuple[PathFit, ...] = field(repr=False)
 
     @cached_property
     def residuals(self) -> Floats:
         """Residuals in windows of the whole path, shape (n, 3)."""
-        return self.problem.find_residuals(self.state)
+        return self.data.find_residuals(self.state)
 
     @property
     def model(self) -> Model:
         """The fitted model with the effects that act on the input."""
-        return Model(self.problem.vehicle, self.state.effects)
+        return Model(self.data.vehicle, self.state.effects)
 
     @property
     def free(self) -> tuple[Free, ...]:
@@ -57,7 +57,7 @@ class Fitted:
 
 
 def fit_model(
-    problem: Problem,
+    data: EstimationData,
     model: Model,
     *,
     per_run: Sequence[str] = (),
@@ -67,11 +67,11 @@ def fit_model(
     """Fit a model's free parameters and the recording's delays.
 
     If wheels are measured as well as commanded, effects of the drivetrain are fitted from the command to
-    the wheels and those of the ground from the wheels to the body: the unexplained residual of one part
+    the wheels and those of the ground from the wheels to the body: the unexplained residual of one path
     does not bias the parameters of the other.
 
     Args:
-        problem: the runs.
+        data: the runs.
         model: effects at neutral values are searched from several starts; others start at their values.
         per_run: labels ``effect.name`` or ids with one value per run.
         start: a fit of nearly the same model, from whose values those of common effects start.
@@ -82,44 +82,46 @@ def fit_model(
         The fit; for a parameter at its bound, the data would fit better beyond it.
     """
     known = () if start is None else start.state.hold([e for e in start.state.effects if e.id in model])
-    state = problem.start_state(known)
-    effects = problem.active_effects(model)
+    state = data.start_state(known)
+    effects = data.active_effects(model)
     common = {effect.id: effect for effect in state.effects}
-    fits: list[PartFit] = []
-    for part in problem.parts:
-        mine = state.hold([common.get(effect.id, effect) for effect in effects if part.owns(effect)])
-        begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
-        fit = problem.fits.recall(begin, partial(_fit_from, problem, part, mine, per_run, exact=exact))
+    fits: list[PathFit] = []
+    for path in data.paths:
+        mine = state.hold([common.get(effect.id, effect) for effect in effects if path.owns(effect)])
+        begin = (path, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
+        fit = data.fits.recall(begin, partial(_fit_from, data, path, mine, per_run, exact=exact))
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
     acting = {effect.id for effect in effects}
-    return Fitted(problem, state.hold([one for one in state.effects if one.id in acting]), tuple(fits))
+    return Fitted(data, state.hold([one for one in state.effects if one.id in acting]), tuple(fits))
 
 
-def _fit_from(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
+def _fit_from(
+    data: EstimationData, path: PathResiduals, state: ModelState, per_run: Sequence[str], *, exact: bool
+) -> PathFit:
     """The fit from a state; effects without values start where they promise most, one after the other."""
     fresh = [
         effect
         for effect in state.effects
         if effect.fixed != {parameter.name for parameter in effect.parameters}
         # A value shared by all runs is no start for the clock of each run.
-        and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
+        and (effect.is_neutral or (effect.id in path.clocks and not state.has_own(effect.id)))
     ]
-    fit = fit_part(part, state.drop([effect.id for effect in fresh]), per_run=per_run)
+    fit = fit_path(path, state.drop([effect.id for effect in fresh]), per_run=per_run)
     for effect in fresh:
         extended = fit.state.add(effect)
-        starts = Screen(fit, [Unset(effect)], problem.largest).list_starts()
+        starts = Screen(fit, [Unset(effect)], data.largest).list_starts()
         if starts:
             extended = starts[0].add_to(fit.state)
             started = extended.find(effect.id)
             # Values that the start does not change may be fitted here.
             extended = extended if started is None else extended.add(effect.change(**started.values))
-        fit = fit_part(part, extended, noise=fit.noise, per_run=per_run)
-    return _write_down(fit_part(part, fit.state, per_run=per_run, exact=True)) if exact else fit
+        fit = fit_path(path, extended, noise=fit.noise, per_run=per_run)
+    return _write_down(fit_path(path, fit.state, per_run=per_run, exact=True)) if exact else fit
 
 
-def _write_down(fit: PartFit) -> PartFit:
+def _write_down(fit: PathFit) -> PathFit:
     """The fit at values as model files have them."""
     state = fit.state.hold([effect.rounded for effect in fit.state.effects])
-    return replace(fit, state=state.centred, residual=fit.part.find_residuals(state))
+    return replace(fit, state=state.centred, residual=fit.path.find_residuals(state))

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import Complex, Floats
+from pipeline.estimation.estimation_data import FEWEST_WINDOWS
 from pipeline.estimation.held_out import find_in_test, refit_fold
-from pipeline.estimation.problem import FEWEST_WINDOWS
 from pipeline.estimation.tolerance import fit_mean_squares
 from pipeline.export.odometry import UPDATE_M, UPDATE_RAD
 
 if TYPE_CHECKING:
+    from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.estimation.problem import Problem
 
 Alphas = tuple[float, float, float, float]
 
@@ -39,24 +39,24 @@ _STILL_M = 0.01
 """Way [m] below which the direction of a step is that of its noise: a turn on the spot, as in AMCL."""
 
 
-def measure_alphas(problem: Problem, fitted: Fitted) -> Alphas | None:
+def measure_alphas(data: EstimationData, fitted: Fitted) -> Alphas | None:
     """AMCL's alphas of a fitted model of wheel odometry; None if the runs have too few predictions.
 
     Args:
-        problem: runs with their measured wheels as input.
+        data: runs with their measured wheels as input.
         fitted: the model.
     """
     walks: list[Walk] = []
-    whole = problem.whole
-    for number, fold in enumerate(problem.folds):
-        state = refit_fold(problem, fitted, number)
-        for run, comparison in enumerate(problem.comparisons):
+    whole = data.whole
+    for number, fold in enumerate(data.folds):
+        state = refit_fold(data, fitted, number)
+        for run, run_residuals in enumerate(data.residuals_by_run):
             mine = whole.run == run
-            near = find_in_test(comparison, whole.times[mine], fold.test[mine])
+            near = find_in_test(run_residuals, whole.times[mine], fold.test[mine])
             if not near.any():
                 continue
-            traced = comparison.trace_horizons(state.effects_of(run), state.timing[run])
-            of = comparison.horizons.number
+            traced = run_residuals.trace_horizons(state.effects_of(run), state.timing[run])
+            of = run_residuals.horizons.number
             for one in np.unique(of[near]).tolist():
                 rows = of == one
                 made = walk(*(series[rows] for series in traced))

@@ -87,12 +87,12 @@ def measure_moves(fitted: Fitted, effect: Effect) -> Moves | None:
     if effect.id not in state.ids:
         return None
     shifts = [
-        comparison.find_horizon_shifts(
+        run_residuals.find_horizon_shifts(
             state.effects_of(run),
             [other for other in state.effects_of(run) if other.id != effect.id],
             state.timing[run],
         )
-        for run, comparison in enumerate(fitted.problem.comparisons)
+        for run, run_residuals in enumerate(fitted.data.residuals_by_run)
     ]
     distance, turn, length = (
         float(np.sqrt(np.mean(np.concatenate(column) ** 2))) for column in zip(*shifts, strict=True)

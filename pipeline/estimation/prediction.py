@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import join_parts, turn_units
-from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.models import Effect, Model, Timing
 from pipeline.run import HORIZON_S, MotionRun
 
@@ -34,19 +34,19 @@ class Prediction:
 
 
 def predict_from(
-    comparison: Comparison, effects: Sequence[Effect], timing: Timing, *, rate_hz: float = 20.0
+    run_residuals: RunResiduals, effects: Sequence[Effect], timing: Timing, *, rate_hz: float = 20.0
 ) -> Prediction:
     """Predict a run over `HORIZON_S`, repeatedly from measured poses.
 
     Args:
-        comparison: the run and its input.
+        run_residuals: the run and its input.
         effects: effects of the model, with their values.
         timing: delays of the recording.
         rate_hz: rate of the result; the model itself runs at `choose_rate`.
     """
-    velocity = comparison.predict_velocity(effects, timing)
-    grid = comparison.grid
-    start_times, start = comparison.list_starts()
+    velocity = run_residuals.predict_velocity(effects, timing)
+    grid = run_residuals.grid
+    start_times, start = run_residuals.list_starts()
     turned = grid.sum_up(velocity.w)
     own = turn_units(0.5 * (turned[1:] + turned[:-1]))
     travelled = grid.sum_up(join_parts(velocity.x, velocity.y) * own)
@@ -56,7 +56,7 @@ def predict_from(
     yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
     path = np.interp(at, index, travelled.real) + 1j * np.interp(at, index, travelled.imag)
     path = path.reshape(yaw.shape)
-    origin = comparison.run.origin
+    origin = run_residuals.run.origin
     turned = start[:, 2:] + yaw - yaw[:, :1] + origin.heading
     turn = np.exp(1j * (start[:, 2] - yaw[:, 0] + origin.heading))
     begin = origin.put_back(join_parts(start[:, 0], start[:, 1]))
@@ -81,22 +81,24 @@ def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Float
     Raises:
         MotionError: the run lacks the input.
     """
-    comparison = Comparison(run, model.vehicle, source)
-    return predict_at_from(comparison, model.effects, Timing(), at)
+    run_residuals = RunResiduals(run, model.vehicle, source)
+    return predict_at_from(run_residuals, model.effects, Timing(), at)
 
 
-def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: Timing, at: Floats) -> Floats:
+def predict_at_from(
+    run_residuals: RunResiduals, effects: Sequence[Effect], timing: Timing, at: Floats
+) -> Floats:
     """As `predict_at`, for a prepared run.
 
     Args:
-        comparison: the run and its input.
+        run_residuals: the run and its input.
         effects: effects of the model, with their values.
         timing: delays of the recording.
         at: times of aligned poses [s], shape (n,).
     """
-    velocity = comparison.predict_velocity(effects, timing)
-    grid = comparison.grid
-    at = at - comparison.run.origin.time_s
+    velocity = run_residuals.predict_velocity(effects, timing)
+    grid = run_residuals.grid
+    at = at - run_residuals.run.origin.time_s
     columns = [np.interp(at, grid.times, values) for values in (velocity.x, velocity.y, velocity.w)]
     predicted = np.column_stack(columns)
     predicted[grid.find_span(at) < 0] = np.nan

@@ -33,11 +33,11 @@ from pipeline.core import (
     robust_spreads,
     student_quantile,
 )
-from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.errors import errors_as_json
+from pipeline.estimation.estimation_data import FEWEST_WINDOWS, EstimationData
 from pipeline.estimation.held_out import HeldOut, hold_out, number_predictions, score
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
+from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import CLIP, locate_windows
 from pipeline.models import AddedEffect, Effect, Model, Place, Timing
 from pipeline.results import ERRORS_OVER_2S, read_error
@@ -46,7 +46,7 @@ from pipeline.run import SPAN_S, MeasuredDrive, MotionError, Rolling, RunContext
 if TYPE_CHECKING:
     from pipeline.estimation.held_out import HeldOut
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.estimation.state import State
+    from pipeline.estimation.model_state import ModelState
 
 
 @dataclass(frozen=True)
@@ -125,28 +125,28 @@ class Contest:
         return {metric: [rival.name for rival in self.list_ties(metric)] for metric in ERRORS_OVER_2S}
 
 
-def judge_rival(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
+def judge_rival(data: EstimationData, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
     """Fit a model to runs and score it as the ladder scores its steps."""
-    return judge_fit(problem, name, *time_fit(problem, model, per_run))
+    return judge_fit(data, name, *time_fit(data, model, per_run))
 
 
-def time_fit(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, float]:
+def time_fit(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, float]:
     """The fit of a model, and its processor time [s]."""
     start = time.process_time()
-    active = model.keep(effect.id for effect in problem.active_effects(model))
-    fitted = fit_model(problem, active, per_run=per_run, exact=True)
+    active = model.keep(effect.id for effect in data.active_effects(model))
+    fitted = fit_model(data, active, per_run=per_run, exact=True)
     return fitted, time.process_time() - start
 
 
-def judge_fit(problem: Problem, name: str, fitted: Fitted, fit_s: float) -> Rival:
+def judge_fit(data: EstimationData, name: str, fitted: Fitted, fit_s: float) -> Rival:
     """Score a fit as the ladder scores its steps."""
     numbers = len({number.label for number in fitted.free if number.effect})
-    return Rival(name, numbers, hold_out(problem, fitted), fit_s)
+    return Rival(name, numbers, hold_out(data, fitted), fit_s)
 
 
-def hold_contest(problem: Problem, rivals: Sequence[Rival]) -> Contest:
+def hold_contest(data: EstimationData, rivals: Sequence[Rival]) -> Contest:
     """Comparison of models that were scored on the same runs."""
-    return Contest(tuple(rivals), np.concatenate(number_predictions(problem)))
+    return Contest(tuple(rivals), np.concatenate(number_predictions(data)))
 
 
 def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
@@ -253,9 +253,9 @@ def list_learners() -> tuple[Learner, ...]:
         from sklearn.linear_model import BayesianRidge  # noqa: PLC0415
         from sklearn.pipeline import make_pipeline, make_union  # noqa: PLC0415
         from sklearn.preprocessing import FunctionTransformer, StandardScaler  # noqa: PLC0415
-    except ImportError as problem:
+    except ImportError as error:
         hint = "Install the extra: pip install 'slip-pipeline[learn]'"
-        raise SlipError("learn_needed", "scikit-learn is not installed", hint=hint) from problem
+        raise SlipError("learn_needed", "scikit-learn is not installed", hint=hint) from error
     return (
         Learner(
             "learned_linear",
@@ -319,9 +319,9 @@ class Learned:
 
     regressors: tuple[Regressor, ...]
 
-    def add_to(self, comparison: Comparison, features: Floats | None = None) -> tuple[Effect, ...]:
+    def add_to(self, run_residuals: RunResiduals, features: Floats | None = None) -> tuple[Effect, ...]:
         """The learned term of a run."""
-        known = make_features(comparison) if features is None else features
+        known = make_features(run_residuals) if features is None else features
         with threadpool_limits(1):
             added = np.column_stack([one.predict(known) for one in self.regressors])
         return (LearnedTerm(added),)
@@ -332,29 +332,29 @@ class Lesson:
     """Training runs with the features of their cells and windows.
 
     Attributes:
-        problem: the runs.
+        data: the runs.
         learner: the kind of regression.
     """
 
-    problem: Problem
+    data: EstimationData
     learner: Learner
     _features: dict[int, Floats] = field(default_factory=dict, repr=False)
 
     def read_features(self, run: int) -> Floats:
         """Features of the cells of a run, shape (n, p)."""
         if run not in self._features:
-            self._features[run] = make_features(self.problem.comparisons[run])
+            self._features[run] = make_features(self.data.residuals_by_run[run])
         return self._features[run]
 
     @cached_property
     def windows(self) -> tuple[Floats, Flags]:
         """Mean features of all windows, shape (n, p), and whether a window lies within one prediction."""
         averages = [
-            average_features(c, self.read_features(run)) for run, c in enumerate(self.problem.comparisons)
+            average_features(c, self.read_features(run)) for run, c in enumerate(self.data.residuals_by_run)
         ]
         return np.concatenate([one[0] for one in averages]), np.concatenate([one[1] for one in averages])
 
-    def learn(self, state: State, rows: Flags) -> Learned:
+    def learn(self, state: ModelState, rows: Flags) -> Learned:
         """Learn the residuals of a model on some windows.
 
         Args:
@@ -365,11 +365,11 @@ class Lesson:
         rows = rows & whole
         if rows.sum() < FEWEST_WINDOWS:
             what = f"{int(rows.sum())} half seconds can be learned from; {FEWEST_WINDOWS} are needed"
-            raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
+            raise MotionError("too_short", what, where=", ".join(self.data.names), hint="Drive longer.")
         residuals_of = [
             # Restarted: errors that a reset to measured states removes are not learned a second time.
-            comparison.find_residuals(state.effects_of(run), state.timing[run], restarted=True)
-            for run, comparison in enumerate(self.problem.comparisons)
+            run_residuals.find_residuals(state.effects_of(run), state.timing[run], restarted=True)
+            for run, run_residuals in enumerate(self.data.residuals_by_run)
         ]
         residuals = np.concatenate(residuals_of)[rows]
         most = CLIP * np.maximum(robust_spreads(residuals), 1e-9)
@@ -380,30 +380,30 @@ class Lesson:
                 one.fit(features[rows], target)
         return Learned(made)
 
-    def learn_fold(self, state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
+    def learn_fold(self, state: ModelState, rows: Flags) -> Callable[[int], Sequence[Effect]]:
         """Learned terms from some windows by run, as `hold_out` requires."""
         learned = self.learn(state, rows)
-        return lambda run: learned.add_to(self.problem.comparisons[run], self.read_features(run))
+        return lambda run: learned.add_to(self.data.residuals_by_run[run], self.read_features(run))
 
 
-def judge_learned(problem: Problem, fitted: Fitted, learner: Learner) -> Rival:
+def judge_learned(data: EstimationData, fitted: Fitted, learner: Learner) -> Rival:
     """Score a fit with a regression added, as the ladder scores its steps."""
-    lesson = Lesson(problem, learner)
+    lesson = Lesson(data, learner)
     start = time.process_time()
-    lesson.learn(fitted.state, np.ones(problem.whole.run.size, dtype=bool))
+    lesson.learn(fitted.state, np.ones(data.whole.run.size, dtype=bool))
     fit_s = time.process_time() - start
-    return Rival(learner.name, None, hold_out(problem, fitted, lesson.learn_fold), fit_s)
+    return Rival(learner.name, None, hold_out(data, fitted, lesson.learn_fold), fit_s)
 
 
-def score_learned(problem: Problem, state: State, learned: Learned) -> HeldOut:
+def score_learned(data: EstimationData, state: ModelState, learned: Learned) -> HeldOut:
     """Score a term learned on other runs, with an unchanged model."""
-    return score(problem, state, lambda run: learned.add_to(problem.comparisons[run]))
+    return score(data, state, lambda run: learned.add_to(data.residuals_by_run[run]))
 
 
-def make_features(comparison: Comparison) -> Floats:
+def make_features(run_residuals: RunResiduals) -> Floats:
     """Features of a learned term at every cell of a run, shape (n, p)."""
-    context = comparison.restarts
-    ideal = comparison.predict_velocity((), Timing())
+    context = run_residuals.restarts
+    ideal = run_residuals.predict_velocity((), Timing())
     signals = [ideal.x, ideal.w]
     if context.vehicle.kinematics.has_inputs("sideways"):
         signals.append(ideal.y)
@@ -426,18 +426,18 @@ def make_features(comparison: Comparison) -> Floats:
         np.sign(turning),
         *context.attitude[:, :2].T,
     ]
-    columns += _look_back(comparison, np.column_stack((ideal.x, ideal.y, ideal.w)))
+    columns += _look_back(run_residuals, np.column_stack((ideal.x, ideal.y, ideal.w)))
     return np.column_stack(columns)
 
 
-def _look_back(comparison: Comparison, ideal: Floats) -> list[Floats]:
+def _look_back(run_residuals: RunResiduals, ideal: Floats) -> list[Floats]:
     """Measurements at the start of each prediction less the input, and their decayed values."""
-    context = comparison.restarts
+    context = run_residuals.restarts
     reset = context.body.number
     began = context.body.at[reset]
     surplus = [np.nan_to_num(context.body.start[reset] - ideal[began])]
-    if comparison.source is Input.COMMAND and comparison.run.wheels is not None:
-        seen = MeasuredDrive(comparison.run.wheels).interpolate(context.times[context.body.at], 0.0)
+    if run_residuals.source is Input.COMMAND and run_residuals.run.wheels is not None:
+        seen = MeasuredDrive(run_residuals.run.wheels).interpolate(context.times[context.body.at], 0.0)
         rolled = roll_ideally(seen, context)
         wheels = np.column_stack((rolled.v0, rolled.w0))
         surplus.append((wheels - ideal[context.body.at][:, [0, 2]])[reset])
@@ -447,9 +447,9 @@ def _look_back(comparison: Comparison, ideal: Floats) -> list[Floats]:
     return [age, *known.T, *np.column_stack(fading).T]
 
 
-def average_features(comparison: Comparison, features: Floats) -> tuple[Floats, Flags]:
+def average_features(run_residuals: RunResiduals, features: Floats) -> tuple[Floats, Flags]:
     """Means of features over the windows of a run, and whether a window lies within one prediction."""
-    spans, context = locate_windows(comparison), comparison.restarts
+    spans, context = locate_windows(run_residuals), run_residuals.restarts
     total = np.concatenate((np.zeros((1, features.shape[1])), np.cumsum(features, axis=0)))
     first, last = spans.first, spans.last
     means = (total[last + 1] - total[first]) / (last + 1 - first)[:, None]

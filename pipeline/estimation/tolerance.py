@@ -23,16 +23,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import CONFIDENCE, JSON_DIGITS, STRETCH_S, Floats, Ints, finite_or_none, pick_finite
+from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import find_in_test, number_predictions, refit_fold
 from pipeline.estimation.model_fit import fit_model
-from pipeline.estimation.problem import Problem
 from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import drop_learned
 from pipeline.run import HORIZON_S, NODE_S, SPAN_S, STILL_MPS, MotionError
 
 if TYPE_CHECKING:
-    from pipeline.estimation.comparison import Comparison, Input
     from pipeline.estimation.model_fit import Fitted
+    from pipeline.estimation.run_residuals import Input, RunResiduals
     from pipeline.models import ModelFile
     from pipeline.run import MotionRun
 
@@ -282,12 +282,12 @@ def gather_samples(
     parts: list[Samples] = []
     seen = 0
     for run in runs:
-        problem = Problem([run], file.model.vehicle, source)
+        data = EstimationData([run], file.model.vehicle, source)
         if run.name in known:
-            fitted = fit_model(problem, drop_learned(file.model), per_run=file.per_run, exact=True)
+            fitted = fit_model(data, drop_learned(file.model), per_run=file.per_run, exact=True)
         else:
-            fitted = fit_as_it_is(problem, file.model, file.per_run)
-        part = _hold_out_at(problem, fitted, ahead_s)
+            fitted = fit_as_it_is(data, file.model, file.per_run)
+        part = _hold_out_at(data, fitted, ahead_s)
         parts.append(Samples(part.speed, part.error, part.stretch + seen))
         seen = int(parts[-1].stretch.max(initial=seen)) + 1
     return Samples(
@@ -295,29 +295,29 @@ def gather_samples(
     )
 
 
-def _hold_out_at(problem: Problem, fitted: Fitted, ahead_s: float) -> Samples:
+def _hold_out_at(data: EstimationData, fitted: Fitted, ahead_s: float) -> Samples:
     """Held-out errors of one run's predictions at a time ahead."""
-    (comparison,), whole = problem.comparisons, problem.whole
-    rows = _find_rows(comparison, ahead_s)
-    horizons = comparison.horizons
-    ends = comparison.nodes.times[np.column_stack((horizons.origin[rows], horizons.node[rows]))]
-    edges = comparison.grid.locate_edges(ends.ravel()).reshape(ends.shape).astype(np.int64)
+    (run_residuals,), whole = data.residuals_by_run, data.whole
+    rows = _find_rows(run_residuals, ahead_s)
+    horizons = run_residuals.horizons
+    ends = run_residuals.nodes.times[np.column_stack((horizons.origin[rows], horizons.node[rows]))]
+    edges = run_residuals.grid.locate_edges(ends.ravel()).reshape(ends.shape).astype(np.int64)
     since = ends[:, 1] - ends[:, 0]
     error, speed = (np.full(rows.size, np.nan) for _ in range(2))
-    for number, fold in enumerate(problem.folds):
-        near = find_in_test(comparison, whole.times, fold.test)[rows]
+    for number, fold in enumerate(data.folds):
+        near = find_in_test(run_residuals, whole.times, fold.test)[rows]
         if near.any():
-            state = refit_fold(problem, fitted, number)
+            state = refit_fold(data, fitted, number)
             effects, timing = state.effects_of(0), state.timing[0]
-            error[near] = comparison.find_horizon_errors(effects, timing).position[rows][near]
-            velocity = comparison.predict_velocity(effects, timing, restarted=True)
-            moved = comparison.grid.sum_up(np.hypot(velocity.x, velocity.y))
-            speed[near] = _find_fastest(moved, edges[near], comparison.grid.step_s)
+            error[near] = run_residuals.find_horizon_errors(effects, timing).position[rows][near]
+            velocity = run_residuals.predict_velocity(effects, timing, restarted=True)
+            moved = run_residuals.grid.sum_up(np.hypot(velocity.x, velocity.y))
+            speed[near] = _find_fastest(moved, edges[near], run_residuals.grid.step_s)
     # Who stands still or turns on the spot has no speed that could be limited.
     known = np.isfinite(error) & (speed > STILL_MPS)
     # Poses are not exactly at the time ahead: over tenths of a second, errors grow in proportion to it.
     error *= ahead_s / since
-    stretches = number_predictions(problem)[0][rows]
+    stretches = number_predictions(data)[0][rows]
     return Samples(speed[known], error[known], stretches[known])
 
 
@@ -337,9 +337,9 @@ def _find_fastest(moved: Floats, edges: Ints, step_s: float) -> Floats:
     return np.array([sustained[a : b + 1].max(initial=0.0) for a, b in zip(starts, ends, strict=True)])
 
 
-def _find_rows(comparison: Comparison, ahead_s: float) -> Ints:
+def _find_rows(run_residuals: RunResiduals, ahead_s: float) -> Ints:
     """Row of each prediction's pose nearest to a time ahead; none where poses are rarer than that time."""
-    horizons, times = comparison.horizons, comparison.nodes.times
+    horizons, times = run_residuals.horizons, run_residuals.nodes.times
     gap = np.abs(times[horizons.node] - times[horizons.origin] - ahead_s)
     order = np.lexsort((gap, horizons.number))
     first = np.flatnonzero(np.diff(horizons.number[order], prepend=-1))

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, hold_out
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import Problem
 from pipeline.models import Model, drop_learned
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.comparison import Input
+    from pipeline.estimation.run_residuals import Input
     from pipeline.run import MotionRun
 
 CARRIES_OVER = 1.1
@@ -64,10 +64,10 @@ def carry_over(
     """
     transfers = []
     for run in runs:
-        problem = Problem([run], model.vehicle, source)
-        carried = hold_out(problem, fit_as_it_is(problem, model, per_run))
-        own = hold_out(problem, fit_model(problem, drop_learned(model), exact=True))
-        ideal = hold_out(problem, fit_model(problem, model.ideal, exact=True))
+        data = EstimationData([run], model.vehicle, source)
+        carried = hold_out(data, fit_as_it_is(data, model, per_run))
+        own = hold_out(data, fit_model(data, drop_learned(model), exact=True))
+        ideal = hold_out(data, fit_model(data, model.ideal, exact=True))
         ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
         ratio = float(np.exp(np.mean(np.log(ratios))))
         transfers.append(
@@ -76,10 +76,10 @@ def carry_over(
     return transfers
 
 
-def fit_as_it_is(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:
+def fit_as_it_is(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> Fitted:
     """A model with its values: only delays of the recording and parameters of single runs are fitted."""
     return fit_model(
-        problem,
+        data,
         model.swap(
             *(
                 effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in per_run))

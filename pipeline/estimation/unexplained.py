@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.core import Floats
-    from pipeline.estimation.comparison import Comparison
-    from pipeline.estimation.fit import PartFit
-    from pipeline.estimation.ladder import Judgement, LadderStep
+    from pipeline.estimation.fit import PathFit
+    from pipeline.estimation.ladder import LadderStep, ModelAssessment
     from pipeline.estimation.learned_step import LearnedStep
+    from pipeline.estimation.run_residuals import RunResiduals
     from pipeline.models import FormulaEffect
 
 _SHAPES = 8640
@@ -54,12 +54,12 @@ def search_formula(
     Returns:
         The effects that stay, and the formula; None where none is accepted.
     """
-    first, *others = search.part.comparisons
+    first, *others = search.path.residuals_by_run
     wheels = not others and first.context.vehicle.kind == "differential"
     terms = list_terms(sideways=sideways, wheels=wheels)
     final = outcome.final
     wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
-    offers: list[tuple[PartFit, PartFit, float]] = []
+    offers: list[tuple[PathFit, PathFit, float]] = []
     if wide.screen(final).list_singles():
         beside = wide.run(final.state)
         for fit in (beside.final, *(rival.judged.fit for rival in beside.rivals)):
@@ -97,7 +97,7 @@ def search_formula(
     return replace(outcome, final=base), join_formula(_list_terms(chosen))
 
 
-def _list_terms(fit: PartFit) -> list[FormulaEffect]:
+def _list_terms(fit: PathFit) -> list[FormulaEffect]:
     return [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
 
 
@@ -116,29 +116,31 @@ class Suggestion:
     leading: LadderStep | None
 
 
-def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) -> Suggestion | None:
+def suggest(
+    assessment: ModelAssessment, formula: FormulaEffect, leading: ModelAssessment
+) -> Suggestion | None:
     """A formula as a suggestion, with the model with it; None where it does not lower the errors.
 
     Args:
-        judgement: of the model without it, from what it was found on.
+        assessment: of the model without it, from what it was found on.
         formula: with its values.
         leading: of that model from the input that the diagnosis speaks of, whose errors are those said.
     """
     with suppress(MotionError):
-        step = judge_whole(judgement.problem, judgement.fitted.model + formula)
-        if not lowers_errors(judgement.whole.errors, step.errors):
+        step = judge_whole(assessment.data, assessment.fitted.model + formula)
+        if not lowers_errors(assessment.whole.errors, step.errors):
             return None
         before, after = (
             np.mean(held.residuals**2, axis=0, where=np.isfinite(held.residuals))
-            for held in (judgement.whole.held_out, step.held_out)
+            for held in (assessment.whole.held_out, step.held_out)
         )
         falls = 1.0 - after / np.maximum(before, 1e-18)
         channel = CHANNELS[int(np.argmax(falls))][-1]
         fitted = step.fitted.model.effect(formula.id)
         channels = tuple(name[-1] for name, fall in zip(CHANNELS, falls.tolist(), strict=True) if fall > 0.0)
         said: LadderStep | None = step
-        if leading is not judgement:
-            said = judge_whole(leading.problem, leading.fitted.model + formula)
+        if leading is not assessment:
+            said = judge_whole(leading.data, leading.fitted.model + formula)
             # What the wheels show may be too little from commands to promise anything of them.
             said = said if lowers_errors(leading.whole.errors, said.errors) else None
         unexplained = Unexplained(
@@ -146,7 +148,7 @@ def suggest(judgement: Judgement, formula: FormulaEffect, leading: Judgement) ->
             float(falls.max()),
             channel,
             channels or (channel,),
-            judgement.problem.source.value,
+            assessment.data.source.value,
             formula=format_effect(fitted),
             with_formula=None if said is None else read_result(errors_as_json(said.errors), Errors),
         )
@@ -175,13 +177,13 @@ def describe_learned(step: LearnedStep, source: str) -> Unexplained | None:
     return Unexplained("learned", fall, letter, (letter,), source, quantity=quantity, of=name, times=times)
 
 
-def find_lasting(fit: PartFit, path: str) -> Unexplained | None:
+def find_lasting(fit: PathFit, path: str) -> Unexplained | None:
     """Motion that lasts longer than noise does and that no recorded signal predicts; None without."""
     noise = fit.noise
-    spans = float(np.median(fit.part.spans))
+    spans = float(np.median(fit.path.spans))
     times = -noise.step_s / np.log(np.clip(noise.correlation, 1e-12, 1.0 - 1e-12))
     sizes = np.sqrt(noise.share) * noise.spread / spans
-    asked = measure_asked(fit.part.comparisons)
+    asked = measure_asked(fit.path.residuals_by_run)
     rms = np.sqrt((fit.residual**2).mean(axis=0)) / spans
     shares = np.minimum((sizes / np.maximum(rms, 1e-12)) ** 2, 1.0)
     lasts = (times >= _LASTS_S) & (shares >= _LEAST_SHARE) & (sizes >= _LEAST_OF_MOTION * asked)
@@ -193,9 +195,9 @@ def find_lasting(fit: PartFit, path: str) -> Unexplained | None:
     return Unexplained("lasting", float(shares[order[0]]), every[0], tuple(every), path, sizes=lasting)
 
 
-def measure_asked(comparisons: Sequence[Comparison]) -> Floats:
+def measure_asked(residuals_by_run: Sequence[RunResiduals]) -> Floats:
     """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
-    velocities = [comparison.predict_velocity((), Timing()) for comparison in comparisons]
+    velocities = [run_residuals.predict_velocity((), Timing()) for run_residuals in residuals_by_run]
     x, y, w = (
         math.sqrt(float(np.mean(np.concatenate([getattr(one, name) for one in velocities]) ** 2)))
         for name in ("x", "y", "w")
@@ -203,9 +205,9 @@ def measure_asked(comparisons: Sequence[Comparison]) -> Floats:
     return np.maximum([x, max(x, y), w], 1e-9)
 
 
-def summarize_disturbance(fit: PartFit) -> Disturbance:
+def summarize_disturbance(fit: PathFit) -> Disturbance:
     """What is left of x, y, w."""
-    noise, spans = fit.noise, fit.part.spans[:, None]
+    noise, spans = fit.noise, fit.path.spans[:, None]
     scale = noise.spread
     return Disturbance(
         rms=tuple(np.sqrt(((fit.residual / spans) ** 2).mean(axis=0)).tolist()),

@@ -1,6 +1,6 @@
 """Residuals of a model over windows of half a second, as pages and learned terms look at them.
 
-Models are fitted to increments of about a fifth of a second (`parts`); windows are what people read.
+Models are fitted to increments of about a fifth of a second (`path_residuals`); windows are what people read.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import STRETCH_S, Flags, Floats, Ints, arrays, guarded_spread, robust_spread
-from pipeline.estimation.state import State
+from pipeline.estimation.model_state import ModelState
 from pipeline.models import Timing
 from pipeline.run import NODE_S, SPAN_S, average_spans
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.estimation.comparison import Comparison
+    from pipeline.estimation.run_residuals import RunResiduals
     from pipeline.run import Velocity
 
 CLIP = 6.0
@@ -36,7 +36,7 @@ class WindowResiduals:
     """Measured less predicted velocities in windows of half a second: x [m/s], y [m/s], w [rad/s].
 
     Args:
-        comparisons: runs with an input.
+        residuals_by_run: runs with an input.
 
     Attributes:
         run: number of the run of each window, shape (n,).
@@ -46,15 +46,15 @@ class WindowResiduals:
         live: whether the input moves the vehicle during a window or just before, shape (n,).
     """
 
-    def __init__(self, comparisons: Sequence[Comparison]) -> None:
-        self.comparisons = tuple(comparisons)
-        is_on_course = any(comparison.run.is_on_course for comparison in comparisons)
+    def __init__(self, residuals_by_run: Sequence[RunResiduals]) -> None:
+        self.residuals_by_run = tuple(residuals_by_run)
+        is_on_course = any(run_residuals.run.is_on_course for run_residuals in residuals_by_run)
         # A course is the direction of travel: no lateral motion is measured.
         self.channels = (0, 2) if is_on_course else (0, 1, 2)
-        windows = [c.windows for c in self.comparisons]
+        windows = [c.windows for c in self.residuals_by_run]
         self.run: Ints = np.repeat(np.arange(len(windows)), [w.start.size for w in windows])
         self.times: Floats = np.concatenate([w.times for w in windows])
-        begin = np.array([comparison.run.start_s for comparison in self.comparisons])
+        begin = np.array([run_residuals.run.start_s for run_residuals in self.residuals_by_run])
         self._since: Floats = self.times.mean(axis=1) - begin[self.run]
         self.unit = self.number_stretches(STRETCH_S)
         self.live = find_live(self.find_ideal())
@@ -63,13 +63,15 @@ class WindowResiduals:
         """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
         return number_stretches(self.run, self._since, length)
 
-    def find_run_residuals(self, state: State, run: int) -> Floats:
+    def find_run_residuals(self, state: ModelState, run: int) -> Floats:
         """Residuals of one run, shape (m, 3)."""
-        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
+        return self.residuals_by_run[run].find_residuals(state.effects_of(run), state.timing[run])
 
-    def find_residuals(self, state: State) -> Floats:
+    def find_residuals(self, state: ModelState) -> Floats:
         """Residuals of all runs, shape (n, 3)."""
-        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+        return np.concatenate(
+            [self.find_run_residuals(state, run) for run in range(len(self.residuals_by_run))]
+        )
 
     def find_ideal(self) -> Floats:
         """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
@@ -78,13 +80,15 @@ class WindowResiduals:
             f_x, f_w, and f_y of a vehicle that moves sideways, lags a quarter of a
             second apart, shape (n, lags, 2 or 3).
         """
-        return np.concatenate([average_lags(c, c.predict_velocity((), Timing())) for c in self.comparisons])
+        return np.concatenate(
+            [average_lags(c, c.predict_velocity((), Timing())) for c in self.residuals_by_run]
+        )
 
     def find_attitude(self) -> Floats:
         """Roll and pitch in the middle of every window [rad], shape (n, 2)."""
         middles = [
-            (self.times[self.run == run].mean(axis=1), comparison.context)
-            for run, comparison in enumerate(self.comparisons)
+            (self.times[self.run == run].mean(axis=1), run_residuals.context)
+            for run, run_residuals in enumerate(self.residuals_by_run)
         ]
         attitudes = [
             np.column_stack([np.interp(at, context.times, column) for column in context.attitude[:, :2].T])
@@ -95,8 +99,8 @@ class WindowResiduals:
     def find_places(self) -> Floats:
         """Where the vehicle was in the middle of every window: x, y in the map [m], shape (n, 2)."""
         middles = [
-            (self.times[self.run == run].mean(axis=1), comparison.run.track)
-            for run, comparison in enumerate(self.comparisons)
+            (self.times[self.run == run].mean(axis=1), run_residuals.run.track)
+            for run, run_residuals in enumerate(self.residuals_by_run)
         ]
         places = [
             np.column_stack([np.interp(at, track.times, column) for column in track.position.T])
@@ -107,9 +111,9 @@ class WindowResiduals:
     @cached_property
     def noise(self) -> Floats:
         """Spread that remains after a regression on the input's past, by channel, shape (3,)."""
-        residual = self.find_residuals(State((), (Timing(),) * len(self.comparisons)))
+        residual = self.find_residuals(ModelState((), (Timing(),) * len(self.residuals_by_run)))
         spreads = np.zeros(3)
-        for run in range(len(self.comparisons)):
+        for run in range(len(self.residuals_by_run)):
             rows = self.run == run
             columns = make_features(self.find_ideal()[rows])
             for channel in self.channels:
@@ -172,11 +176,11 @@ def number_stretches(run: Ints, since: Floats, length: float = STRETCH_S) -> Int
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
 
 
-def count_seconds(part: WindowResiduals) -> Floats:
+def count_seconds(windows: WindowResiduals) -> Floats:
     """Seconds that each window adds to the preceding ones, so that overlaps count once, shape (n,)."""
-    starts = part.times[:, 0]
+    starts = windows.times[:, 0]
     further = np.append(np.diff(starts), np.inf)
-    further[np.flatnonzero(np.diff(part.run))] = np.inf
+    further[np.flatnonzero(np.diff(windows.run))] = np.inf
     return np.asarray(np.minimum(further, SPAN_S), dtype=np.float64)
 
 
@@ -197,11 +201,11 @@ class Spans:
     into_last: Floats
     width: Floats
 
-    def average(self, comparison: Comparison, signal: Floats) -> Floats:
+    def average(self, run_residuals: RunResiduals, signal: Floats) -> Floats:
         """Mean of a signal on cells over every window, shape (n,)."""
         return average_spans(
             np.ascontiguousarray(signal),
-            comparison.grid.step_s,
+            run_residuals.grid.step_s,
             self.first,
             self.into_first,
             self.last,
@@ -210,9 +214,9 @@ class Spans:
         )
 
 
-def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
+def locate_windows(run_residuals: RunResiduals, late: float = 0.0) -> Spans:
     """The windows of a comparison, moved ``late`` seconds back, relative to its cell edges."""
-    grid, times = comparison.grid, comparison.windows.times
+    grid, times = run_residuals.grid, run_residuals.windows.times
     start, end = grid.locate_edges(times[:, 0] - late), grid.locate_edges(times[:, 1] - late)
     top = grid.times.size - 1
     first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)
@@ -220,21 +224,21 @@ def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
     return Spans(first, start - first, last, end - last, width)
 
 
-def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) -> Floats:
+def average_windows(run_residuals: RunResiduals, velocity: Velocity, spans: Spans) -> Floats:
     """Mean of (x, y, w) over every window, shape (n, 3)."""
     means, y = np.zeros((spans.first.size, 3)), velocity.y
-    means[:, 0] = spans.average(comparison, velocity.x)
-    means[:, 2] = spans.average(comparison, velocity.w)
+    means[:, 0] = spans.average(run_residuals, velocity.x)
+    means[:, 2] = spans.average(run_residuals, velocity.w)
     if y.any():
-        means[:, 1] = spans.average(comparison, y)
+        means[:, 1] = spans.average(run_residuals, y)
     return means
 
 
-def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
+def average_lags(run_residuals: RunResiduals, velocity: Velocity, lags: int = 9) -> Floats:
     """Means of (x, w), or (x, w, y) for a vehicle that moves sideways, over current and earlier windows."""
     signals = [velocity.x, velocity.w]
-    if comparison.context.vehicle.kinematics.has_inputs("sideways"):
+    if run_residuals.context.vehicle.kinematics.has_inputs("sideways"):
         signals.append(velocity.y)
-    spans = [locate_windows(comparison, NODE_S * lag) for lag in range(lags)]
-    means = [[one.average(comparison, signal) for signal in signals] for one in spans]
+    spans = [locate_windows(run_residuals, NODE_S * lag) for lag in range(lags)]
+    means = [[one.average(run_residuals, signal) for signal in signals] for one in spans]
     return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))

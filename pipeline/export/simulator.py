@@ -13,7 +13,7 @@ import yaml
 
 from pipeline.core import Floats
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Amount, Current, Facts, Target, start_table, write_yaml
-from pipeline.models import Effect, Forward, ModelFile, Place, Quantity, Timing
+from pipeline.models import Effect, ForwardModel, ModelFile, Place, Quantity, Timing
 from pipeline.run import DriveSeries, Grid, MotionError, Resets, RunContext
 from pipeline.sources import Vehicle
 
@@ -64,7 +64,7 @@ def find_steady_motion(
         hold(inputs.get("steering", 0.0)),
         hold(inputs["sideways"]) if "sideways" in inputs else None,
     )
-    forward = Forward(series, grid, context, encoders=None, has_gyro=False)
+    forward = ForwardModel(series, grid, context, encoders=None, has_gyro=False)
     acting = [effect for effect in effects if effect.place is not Place.LOCALIZATION]
     moved = forward.run_commands(acting, Timing())
     return float(moved.x[-1]), float(moved.w[-1])

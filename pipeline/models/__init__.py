@@ -55,7 +55,7 @@ if TYPE_CHECKING:
         learned_as_table,
     )
     from pipeline.models.literature import MODELS, LiteratureModel, find_model, list_models
-    from pipeline.models.model import Forward, Model, Timing, replace_context
+    from pipeline.models.model import ForwardModel, Model, Timing, replace_context
     from pipeline.models.model_file import ModelFile, list_code, parse_model, read_model
     from pipeline.models.model_text import (
         check_target,

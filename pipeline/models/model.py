@@ -198,7 +198,7 @@ def _follow(effects: Sequence[Effect], timing: Timing) -> _Path:
     return _Path(commanded, driven, timing.wheel_delay_s, continues, tuple(keys))
 
 
-class Forward:
+class ForwardModel:
     """Predicted velocities of one run for many models.
 
     Args:
@@ -411,8 +411,8 @@ class Forward:
         return rolling.velocity, ground
 
 
-def replace_context(forward: Forward, context: RunContext) -> Forward:
+def replace_context(forward: ForwardModel, context: RunContext) -> ForwardModel:
     """The same input with another run context."""
-    return Forward(
+    return ForwardModel(
         forward.series, forward.grid, context, encoders=forward.encoders, has_gyro=forward.has_gyro
     )

@@ -21,11 +21,11 @@ from pipeline.datasets import (
     list_held,
 )
 from pipeline.estimation import Recording
-from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
-from pipeline.estimation.fit import PartFit, fit_part
-from pipeline.estimation.parts import weigh_runs
-from pipeline.estimation.problem import Problem
+from pipeline.estimation.estimation_data import EstimationData
+from pipeline.estimation.fit import PathFit, fit_path
+from pipeline.estimation.path_residuals import weigh_runs
+from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.logs import LogError, locate_recorded, open_log
 from pipeline.models import Effect, Late, Model, list_effects
 from pipeline.plan.manoeuvres import Area, Limits, Reached, choose_limits, is_steered
@@ -80,24 +80,24 @@ def forecast_deployment(
         return start
     notify(f"fitting {format_count(len(runs), 'run')} jointly")
     geometry, held = runs[0][1], list_held(estimates, vehicle, source)
-    problem = Problem([run for run, _ in runs], geometry, Input(source))
+    data = EstimationData([run for run, _ in runs], geometry, Input(source))
     clocks = [effect for effect in held if effect.late is Late.POSES]
-    shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in problem.runs])
-    fits: list[PartFit] = []
+    shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in data.runs])
+    fits: list[PathFit] = []
     also: list[str] = []
-    timing = problem.start_state().timing
-    for part in (weigh_runs(one, shares) for one in problem.parts):
-        mine = [effect for effect in (*start.effects, *clocks) if part.owns(effect)]
-        active = problem.active_effects(Model(geometry, tuple(mine)))
+    timing = data.start_state().timing
+    for path in (weigh_runs(one, shares) for one in data.paths):
+        mine = [effect for effect in (*start.effects, *clocks) if path.owns(effect)]
+        active = data.active_effects(Model(geometry, tuple(mine)))
         # The delays of the encoders follow from the body: the drivetrain moves wheels before they report it.
-        state = replace(problem.start_state(active), timing=timing)
-        fit = _add_held(fit_part(part, state), held)
+        state = replace(data.start_state(active), timing=timing)
+        fit = _add_held(fit_path(path, state), held)
         also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
         timing = fit.state.timing
         fits.append(fit)
     if also:
         start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
-    return expect_values(start, read_values(problem, fits, terrain))
+    return expect_values(start, read_values(data, fits, terrain))
 
 
 def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
@@ -108,32 +108,32 @@ def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehic
             if manifest is not None:
                 vehicle = load_vehicle(manifest)
                 run = load_motion_run(manifest, vehicle)
-                Comparison(run, vehicle, Input(start.input))
+                RunResiduals(run, vehicle, Input(start.input))
                 yield run, vehicle
 
 
-def _add_held(fit: PartFit, held: Sequence[Effect]) -> PartFit:
+def _add_held(fit: PathFit, held: Sequence[Effect]) -> PathFit:
     """Extend the fit with effects of some stored models if they lower the misfit over all runs."""
     for effect in held:
         taken = any(
             effect.id == one.id or effect.id in one.contains or one.id in effect.contains
             for one in fit.state.effects
         )
-        if taken or not fit.part.owns(effect):
+        if taken or not fit.path.owns(effect):
             continue
-        extended = fit_part(fit.part, fit.state.add(effect))
+        extended = fit_path(fit.path, fit.state.add(effect))
         if find_cost(extended) < find_cost(fit):
             fit = extended
     return fit
 
 
-def read_values(problem: Problem, fits: Sequence[PartFit], terrain: str) -> Mapping[str, float]:
+def read_values(data: EstimationData, fits: Sequence[PathFit], terrain: str) -> Mapping[str, float]:
     """Values of the joint fits by label; a terrain parameter has its value on this terrain.
 
     For a terrain without runs it is the median over the other terrains, which is robust against an unusual
     one such as ice.
     """
-    first = {run.terrain: number for number, run in reversed([*enumerate(problem.runs)])}
+    first = {run.terrain: number for number, run in reversed([*enumerate(data.runs)])}
     runs = [first[terrain]] if terrain in first else [*first.values()]
     values: dict[str, float] = {}
     for fit in fits:
@@ -205,7 +205,7 @@ def plan_drive(
         SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
     """
     knowledge, diagnosis = studied.knowledge, studied.diagnosis
-    reached = Reached() if knowledge.problem is None else measure_reached(knowledge.problem)
+    reached = Reached() if knowledge.data is None else measure_reached(knowledge.data)
     limits = choose_limits(
         vehicle,
         reached,

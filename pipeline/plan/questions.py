@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import chdtri, stdtrit
 
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, STRETCH_S, Flags, Floats, Ints, suffix_unit
-from pipeline.estimation import Free, Problem
+from pipeline.estimation import EstimationData, Free
 from pipeline.estimation.driving_need import find_goal
 from pipeline.models import (
     Effect,
@@ -273,15 +273,15 @@ class Judge:
     def __init__(
         self, rehearsal: Rehearsal, knowledge: Knowledge, edges: Floats, *, stretches: bool = False
     ) -> None:
-        self.problem: Problem = rehearsal.prepare(knowledge.base.effects)
+        self.data: EstimationData = rehearsal.prepare(knowledge.base.effects)
         self.noise = knowledge.noise
         self.size = edges.size - 1
         stretch = edges[:-1] // STRETCH_S if stretches else np.arange(self.size)
         excited = rehearsal.find_excitation(edges)
         self.groups = Groups(np.diff(edges), stretch.astype(np.int64), knowledge.driven_s, excited)
         self._group = [
-            np.clip(np.searchsorted(edges, part.times[:, 1], side="left") - 1, 0, self.size - 1)
-            for part in self.problem.parts
+            np.clip(np.searchsorted(edges, path.times[:, 1], side="left") - 1, 0, self.size - 1)
+            for path in self.data.paths
         ]
         self._known: dict[Hypothesis, tuple[list[Floats], tuple[Free, ...], list[Floats]]] = {}
 
@@ -322,24 +322,24 @@ class Judge:
         """Residuals by part, free parameters with the clocks, and derivatives by part."""
         if model not in self._known:
             state = start_state(model.effects)
-            delays = {name: None for part in self.problem.parts for name in part.delays}
+            delays = {name: None for path in self.data.paths for name in path.delays}
             free = state.list_free(tuple(delays))
             clocks = tuple(number for number in free if not number.effect)
             numbers = (*model.free, *clocks)
-            residuals = [part.find_residuals(state) for part in self.problem.parts]
+            residuals = [path.find_residuals(state) for path in self.data.paths]
             jacobians = []
-            for part, residual in zip(self.problem.parts, residuals, strict=True):
+            for path, residual in zip(self.data.paths, residuals, strict=True):
                 columns = np.zeros((*residual.shape, len(numbers)))
                 mine = [
                     index
                     for index, number in enumerate(numbers)
                     if (
-                        any(e.id == number.effect and part.owns(e) for e in model.effects)
+                        any(e.id == number.effect and path.owns(e) for e in model.effects)
                         if number.effect
-                        else number.name in part.delays
+                        else number.name in path.delays
                     )
                 ]
-                columns[:, :, mine] = part.differentiate(state, residual, [numbers[i] for i in mine])
+                columns[:, :, mine] = path.differentiate(state, residual, [numbers[i] for i in mine])
                 jacobians.append(columns)
             self._known[model] = (residuals, numbers, jacobians)
         return self._known[model]

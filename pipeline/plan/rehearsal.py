@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 
 from pipeline.core import Complex, Flags, Floats
-from pipeline.estimation import Comparison, Input, Problem, State, fit_model
+from pipeline.estimation import EstimationData, Input, ModelState, RunResiduals, fit_model
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.decision import list_costs
-from pipeline.estimation.fit import PartFit
+from pipeline.estimation.fit import PathFit
 from pipeline.estimation.largest import average_sustained, measure_largest
 from pipeline.estimation.model_fit import Fitted
-from pipeline.estimation.state import Free
+from pipeline.estimation.model_state import Free
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models import Effect, Excitation, Largest, Model, Place, Timing
 from pipeline.plan.manoeuvres import Commands, PlanError, Reached, is_steered
@@ -35,7 +35,7 @@ from pipeline.sources import Vehicle
 
 # Commands rehearsed: a run that has not been driven yet, with the poses that a model predicts.
 #
-# Such a run is treated like a recorded run: the same residual problem makes its windows, predictions and
+# Such a run is treated like a recorded run: the same estimation data makes its windows, predictions and
 # derivatives. The ground is assumed to be level.
 
 _POSE_HZ = 20.0
@@ -85,7 +85,7 @@ class Rehearsal:
         self.senses = senses
         self.vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=senses.track_multiplier)
         self._run = _stand_still(commands, self.vehicle, senses, begins)
-        self._comparison = Comparison(self._run, self.vehicle, Input.COMMAND)
+        self._run_residuals = RunResiduals(self._run, self.vehicle, Input.COMMAND)
 
     @property
     def largest(self) -> Largest:
@@ -98,10 +98,10 @@ class Rehearsal:
         Whether commands are large, small, different or changing enough, the information on a question says.
         """
         asked, size = self.predict(()), edges.size - 1
-        group = np.clip(np.searchsorted(edges, self._comparison.grid.times, side="right") - 1, 0, size - 1)
+        group = np.clip(np.searchsorted(edges, self._run_residuals.grid.times, side="right") - 1, 0, size - 1)
 
         def happens(*parts: Flags) -> Flags:
-            counts = [np.bincount(group, part, minlength=size) > 0.0 for part in parts]
+            counts = [np.bincount(group, one, minlength=size) > 0.0 for one in parts]
             return np.column_stack(counts)
 
         ahead, back = asked.x > STILL_MPS, asked.x < -STILL_MPS
@@ -116,14 +116,14 @@ class Rehearsal:
 
     def predict(self, effects: Sequence[Effect]) -> Velocity:
         """Body velocity of a model on the time grid."""
-        return self._comparison.predict_velocity(effects, Timing())
+        return self._run_residuals.predict_velocity(effects, Timing())
 
     def trace(self, effects: Sequence[Effect]) -> tuple[Complex, Floats]:
         """Path of a model from the origin: positions x + iy [m] and headings [rad] at 20 Hz."""
         return self._trace(self.predict(effects))
 
     def _trace(self, velocity: Velocity) -> tuple[Complex, Floats]:
-        grid, times = self._comparison.grid, self._run.track.times
+        grid, times = self._run_residuals.grid, self._run.track.times
         heading = grid.sum_up(velocity.w)
         along = np.exp(0.5j * (heading[1:] + heading[:-1])) * (velocity.x + 1j * velocity.y)
         path = grid.sum_up(along)
@@ -131,8 +131,8 @@ class Rehearsal:
         position = np.interp(at, edges, path.real) + 1j * np.interp(at, edges, path.imag)
         return position, np.interp(at, edges, heading)
 
-    def prepare(self, effects: Sequence[Effect]) -> Problem:
-        """Residual problem of these commands, with poses, wheels and gyro as this model predicts them."""
+    def prepare(self, effects: Sequence[Effect]) -> EstimationData:
+        """Estimation data of these commands, with poses, wheels and gyro as this model predicts them."""
         velocity = self.predict(effects)
         path, heading = self._trace(velocity)
         still = self._run.track
@@ -144,7 +144,7 @@ class Rehearsal:
             attitude=attitude,
             position=np.column_stack((path.real, path.imag)),
         )
-        times = self._comparison.grid.times
+        times = self._run_residuals.grid.times
         run = replace(self._run, track=track)
         if self.senses.gyro is not None:
             known = replace(self.senses.gyro, signed_scale=1.0, bias=0.0, yaw_delay_s=0.0)
@@ -152,7 +152,7 @@ class Rehearsal:
         if self.senses.encoders:
             driven = self.predict([effect for effect in effects if effect.place <= Place.DRIVE])
             run = replace(run, wheels=_read_wheels(times, driven, self.vehicle))
-        return Problem([run], self.vehicle, Input.COMMAND)
+        return EstimationData([run], self.vehicle, Input.COMMAND)
 
 
 _REACHED = 0.99
@@ -161,11 +161,11 @@ _MOVED = 0.05
 """Least speed [m/s], yaw rate [rad/s] and acceleration [m/s^2] that count as driving in this way."""
 
 
-def measure_reached(problem: Problem) -> Reached:
+def measure_reached(data: EstimationData) -> Reached:
     """What the driving of runs reached: commanded speed and yaw rate, and measured accelerations."""
     parts: dict[str, list[Floats]] = {"speed": [], "turn": [], "acceleration": [], "lateral": []}
-    for comparison in problem.comparisons:
-        vehicle, series = comparison.context.vehicle, comparison.run.commands
+    for run_residuals in data.residuals_by_run:
+        vehicle, series = run_residuals.context.vehicle, run_residuals.run.commands
         if series is None:
             continue
         asked = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
@@ -173,12 +173,12 @@ def measure_reached(problem: Problem) -> Reached:
         live = np.maximum(ahead, turned) > _MOVED
         parts["speed"].append(ahead[live])
         parts["turn"].append(turned[live])
-        ideal = comparison.predict_velocity((), Timing())
-        moved = comparison.find_residuals((), Timing())
-        moved = moved + average_windows(comparison, ideal, locate_windows(comparison))
+        ideal = run_residuals.predict_velocity((), Timing())
+        moved = run_residuals.find_residuals((), Timing())
+        moved = moved + average_windows(run_residuals, ideal, locate_windows(run_residuals))
         driven = np.abs(moved[:, [0, 2]]).max(axis=1) > _MOVED
         parts["lateral"].append(np.abs(moved[driven, 0] * moved[driven, 2]))
-        times = comparison.windows.times[:, 0]
+        times = run_residuals.windows.times[:, 0]
         apart = times[2:] - times[:-2]
         near = (apart > 0.0) & (apart < 2.0 * SPAN_S) & driven[1:-1]
         parts["acceleration"].append(np.abs(moved[2:, 0] - moved[:-2, 0])[near] / apart[near])
@@ -192,9 +192,9 @@ def measure_reached(problem: Problem) -> Reached:
     return Reached(*commanded, *(find(name, _REACHED) for name in ("acceleration", "lateral")))
 
 
-def start_state(effects: Sequence[Effect]) -> State:
+def start_state(effects: Sequence[Effect]) -> ModelState:
     """Fit state of a model on a rehearsed run, whose clocks are known."""
-    return State(tuple(effects), (Timing(),))
+    return ModelState(tuple(effects), (Timing(),))
 
 
 def _stand_still(commands: Commands, vehicle: Vehicle, senses: Senses, begins: Floats) -> MotionRun:
@@ -311,26 +311,26 @@ class Knowledge:
         noise: standard deviation of a step's residual by part and channel, as if independent; infinite
             in channels without information, shape (parts, 3).
         fitted: fit of the base to the logs so far; None without logs on this ground.
-        problem: residual problem of the logs so far; None without logs.
+        data: estimation data of the logs so far; None without logs.
     """
 
     vehicle: Vehicle
     senses: Senses
     base: Hypothesis
     noise: Floats
-    problem: Problem | None = None
+    data: EstimationData | None = None
     fitted: Fitted | None = field(default=None, repr=False)
 
     @property
     def driven_s(self) -> float:
         """Length of the logs so far [s]."""
-        return 0.0 if self.problem is None else sum(run.duration_s for run in self.problem.runs)
+        return 0.0 if self.data is None else sum(run.duration_s for run in self.data.runs)
 
     def suppose(self, effects: Sequence[Effect]) -> Hypothesis:
         """Hypothesis of these effects, fitted to any logs so far; neutral effects start from a search."""
-        if self.problem is None:
+        if self.data is None:
             return _assume(tuple(effects), {})
-        return _inform(fit_model(self.problem, Model(self.problem.vehicle, tuple(effects))))
+        return _inform(fit_model(self.data, Model(self.data.vehicle, tuple(effects))))
 
     def rival(self, effects: Sequence[Effect]) -> tuple[Hypothesis, float]:
         """Hypothesis of these effects fitted to the logs so far, and the block t in favour of the base.
@@ -340,11 +340,11 @@ class Knowledge:
         """
         if self.fitted is None:
             raise ValueError("nothing was driven")
-        problem, power = self.fitted.problem, 0.0
-        other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
-        for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
+        data, power = self.fitted.data, 0.0
+        other = fit_model(data, Model(data.vehicle, tuple(effects)))
+        for path, own, fit in zip(data.paths, self.fitted.fits, other.fits, strict=True):
             # The noise is the same for both models.
-            costs = [list_costs(part, own.noise, one.residual) for one in (fit, own)]
+            costs = [list_costs(path, own.noise, one.residual) for one in (fit, own)]
             power += float((costs[0] - costs[1]).sum()) / own.overdispersion
         return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
 
@@ -376,13 +376,13 @@ def learn(
     used = [replace(run, wheels=None) for run in runs]
     if not is_steered(vehicle) and all(run.wheels is not None for run in runs):
         used = list(runs)
-    problem = Problem(used, vehicle, Input.COMMAND)
-    model = Model(problem.vehicle, tuple(effects))
+    data = EstimationData(used, vehicle, Input.COMMAND)
+    model = Model(data.vehicle, tuple(effects))
     if prior:
-        problem = tie_to_prior(problem, prior)
-    fitted = fit_model(problem, model)
+        data = tie_to_prior(data, prior)
+    fitted = fit_model(data, model)
     noise = [_measure_noise(fit) for fit in fitted.fits]
-    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem, fitted)
+    return Knowledge(data.vehicle, read_senses(used), _inform(fitted), np.array(noise), data, fitted)
 
 
 def assume(
@@ -410,12 +410,12 @@ def _inform(fitted: Fitted) -> Hypothesis:
     effects = fitted.state.effects_of(0)
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
     index_of = {number.label: index for index, number in enumerate(free)}
-    total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
+    total = np.diag(_expect(effects, free, fitted.data.paths[0].prior.numbers))
     for fit in fitted.fits:
         columns = fit.white.columns[:, fit.smooth]
         normal = columns.T @ columns / fit.overdispersion
         numbers = [fit.free[index] for index in fit.smooth]
-        is_clock = [not number.effect or number.effect in fit.part.clocks for number in numbers]
+        is_clock = [not number.effect or number.effect in fit.path.clocks for number in numbers]
         mine = [index for index, number in enumerate(numbers) if not is_clock[index] and number.acts_in(0)]
         others = [index for index in range(len(numbers)) if index not in mine]
         known = normal[np.ix_(mine, mine)]
@@ -446,7 +446,7 @@ def _expect(
     return np.array(spread, dtype=np.float64) ** -2.0
 
 
-def _measure_noise(fit: PartFit) -> Floats:
+def _measure_noise(fit: PathFit) -> Floats:
     """Standard deviation of a step by channel, as if steps were independent, shape (3,).
 
     A slow disturbance adds up over many steps, and counts by its sum; the noise of poses cancels.

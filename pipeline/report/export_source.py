@@ -11,7 +11,7 @@ import polars as pl
 import pyarrow.parquet as pq
 
 from pipeline.core import Floats, Ints
-from pipeline.estimation import Comparison, Prediction, choose_input, predict_at_from, predict_from
+from pipeline.estimation import Prediction, RunResiduals, choose_input, predict_at_from, predict_from
 from pipeline.logs.writer import Given, LogWriter
 from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
@@ -263,14 +263,14 @@ class ModelFeed:
         try:
             run = self._load(low, high)
             source = choose_input([run], self._source.input, self._model).source
-            comparison = Comparison(run, self._model.vehicle, source)
+            run_residuals = RunResiduals(run, self._model.vehicle, source)
         except MotionError as error:
             self._refused = self._refused or error
             return None
         self._has_answered = True
         timing = Timing()
-        velocity = predict_at_from(comparison, self._model.effects, timing, at)
-        made = _predict_within(comparison, self._model.effects, timing, low, high)
+        velocity = predict_at_from(run_residuals, self._model.effects, timing, at)
+        made = _predict_within(run_residuals, self._model.effects, timing, low, high)
         return Stretch(velocity, made)
 
     def check(self) -> None:
@@ -304,12 +304,12 @@ class ModelFeed:
 
 
 def _predict_within(
-    comparison: Comparison, effects: Sequence[Effect], timing: Timing, low: float, high: float
+    run_residuals: RunResiduals, effects: Sequence[Effect], timing: Timing, low: float, high: float
 ) -> Prediction:
     """Predictions that start in a stretch, from the measured positions."""
-    made = predict_from(comparison, effects, timing)
+    made = predict_from(run_residuals, effects, timing)
     mask = (made.start_times >= low) & (made.start_times < high)
-    track = comparison.run.track
+    track = run_residuals.run.track
     poses = made.poses[mask]
     for axis in range(2):
         at = np.interp(made.start_times[mask], track.times, track.position[:, axis])

@@ -8,9 +8,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Floats
-from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
-from pipeline.estimation.comparison import HorizonErrors
+from pipeline.estimation import EstimationData, Fitted, ModelState, choose_input, fit_model, predict_from
 from pipeline.estimation.effect_signature import Signature, find_signatures, measure_variables
+from pipeline.estimation.run_residuals import HorizonErrors
 from pipeline.models import Model, Timing
 from pipeline.results import Errors, RunDiagnosis, Step, read_model
 from pipeline.run import MotionError, load_run
@@ -65,24 +65,24 @@ class MotionStage:
     """Run prepared for evaluating many models.
 
     Args:
-        problem: the runs; the first one is shown.
+        data: the runs; the first one is shown.
         places: measured ``t x y`` of that run in the map as starts of predicted paths; None keeps the
             coordinates of the plane of motion.
     """
 
-    def __init__(self, problem: Problem, places: pl.DataFrame | None = None) -> None:
-        self.problem = problem
+    def __init__(self, data: EstimationData, places: pl.DataFrame | None = None) -> None:
+        self.data = data
         self._places = places
-        self._comparison = problem.comparisons[0]
+        self._run_residuals = data.residuals_by_run[0]
 
     @cached_property
     def ideal(self) -> Fitted:
         """The ideal model with the recording's delays."""
-        return fit_model(self.problem, Model(self.problem.vehicle))
+        return fit_model(self.data, Model(self.data.vehicle))
 
     @cached_property
     def _ideal_errors(self) -> HorizonErrors:
-        return self._comparison.find_horizon_errors((), self.ideal.state.timing[0])
+        return self._run_residuals.find_horizon_errors((), self.ideal.state.timing[0])
 
     @cached_property
     def _ideal_arcs(self) -> pl.DataFrame:
@@ -90,10 +90,10 @@ class MotionStage:
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
-        measured = measure_variables(self._comparison)
+        measured = measure_variables(self._run_residuals)
         return {name: measured[name] for name in SIGNALS}
 
-    def view(self, state: State, ladder: Sequence[Step], floor: Errors | None) -> MotionView:
+    def view(self, state: ModelState, ladder: Sequence[Step], floor: Errors | None) -> MotionView:
         """Return the rows of one model.
 
         Args:
@@ -101,54 +101,54 @@ class MotionStage:
             ladder: its steps.
             floor: noise floor; None if unknown.
         """
-        comparison = self._comparison
-        rows = self.problem.whole.run == 0
-        ideal, model = self.ideal.residuals[rows], self.problem.find_run_residuals(state, 0)
+        run_residuals = self._run_residuals
+        rows = self.data.whole.run == 0
+        ideal, model = self.ideal.residuals[rows], self.data.find_run_residuals(state, 0)
         effects, timing = state.effects_of(0), state.timing[0]
         residuals = pl.DataFrame(
             {
-                "t": comparison.windows.times.mean(axis=1) + comparison.run.origin.time_s,
+                "t": run_residuals.windows.times.mean(axis=1) + run_residuals.run.origin.time_s,
                 **{f"ideal_{name}": ideal[:, i] for i, name in enumerate(COMPONENTS)},
                 **{f"model_{name}": model[:, i] for i, name in enumerate(COMPONENTS)},
                 **self._signals,
             }
         )
         return MotionView(
-            input=self.problem.source.value,
+            input=self.data.source.value,
             effects=state.ids,
             ladder=ladder,
             floor=floor,
             residuals=residuals,
             velocity=self._draw_velocity(state),
-            horizon_errors=self._gather_errors(comparison.find_horizon_errors(effects, timing)),
+            horizon_errors=self._gather_errors(run_residuals.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
-            signatures=find_signatures(self.problem, state),
+            signatures=find_signatures(self.data, state),
             ideal_arcs=self._ideal_arcs,
         )
 
-    def _draw_velocity(self, state: State) -> pl.DataFrame:
-        grid = self._comparison.grid
-        velocity = self._comparison.predict_velocity(state.effects_of(0), state.timing[0])
+    def _draw_velocity(self, state: ModelState) -> pl.DataFrame:
+        grid = self._run_residuals.grid
+        velocity = self._run_residuals.predict_velocity(state.effects_of(0), state.timing[0])
         every = max(round(1.0 / (_RATE_HZ * grid.step_s)), 1)
         picked = slice(every // 2, None, every)
         columns = {f"v_{name}": getattr(velocity, name)[picked] for name in COMPONENTS}
         return pl.DataFrame(
             {
-                "t": grid.times[picked] + self._comparison.run.origin.time_s,
+                "t": grid.times[picked] + self._run_residuals.run.origin.time_s,
                 "piece": grid.span[picked].astype(np.int32),
                 **columns,
             }
         )
 
     def _gather_errors(self, predicted: HorizonErrors) -> pl.DataFrame:
-        horizons, ideal = self._comparison.horizons, self._ideal_errors
+        horizons, ideal = self._run_residuals.horizons, self._ideal_errors
         count = np.maximum(np.bincount(horizons.number), 1)
 
         def size(errors: Floats) -> Floats:
             return np.asarray(np.sqrt(np.bincount(horizons.number, errors**2) / count), dtype=np.float64)
 
         first = np.unique(horizons.number, return_index=True)[1]
-        times = horizons.times[first, 0] + self._comparison.run.origin.time_s
+        times = horizons.times[first, 0] + self._run_residuals.run.origin.time_s
         present = np.unique(horizons.number)
         broken = np.diff(times, prepend=times[:1]) > _BROKEN_S
         return pl.DataFrame(
@@ -162,8 +162,8 @@ class MotionStage:
             }
         )
 
-    def _draw_arcs(self, state: State) -> pl.DataFrame:
-        made = predict_from(self._comparison, state.effects_of(0), state.timing[0], rate_hz=_ARC_RATE_HZ)
+    def _draw_arcs(self, state: ModelState) -> pl.DataFrame:
+        made = predict_from(self._run_residuals, state.effects_of(0), state.timing[0], rate_hz=_ARC_RATE_HZ)
         slot = np.floor(made.start_times / _ARC_EVERY_S)
         rows = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
         x, y = made.poses[rows, :, 0], made.poses[rows, :, 1]
@@ -205,10 +205,10 @@ def view_diagnosis(
     try:
         run = load_run(tables, vehicle, name=diagnosis.run)
         source = choose_input([run], diagnosis.input or None).source
-        problem = Problem([run], vehicle, source)
+        data = EstimationData([run], vehicle, source)
     except MotionError:
         # A log with too little data for a model still has its slip.
         return None
-    state = State(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
+    state = ModelState(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
-    return MotionStage(problem, places).view(state, diagnosis.ladder, diagnosis.noise_floor)
+    return MotionStage(data, places).view(state, diagnosis.ladder, diagnosis.noise_floor)

@@ -19,11 +19,11 @@ from pipeline.core import Floats
 from pipeline.estimation import (
     Errors,
     Estimates,
+    EstimationData,
     Fitted,
     HeldOut,
     Input,
-    Problem,
-    State,
+    ModelState,
     choose_input,
 )
 from pipeline.estimation.additions import explain_refusal, explain_refusals
@@ -33,7 +33,7 @@ from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
+from pipeline.estimation.ladder import LadderStep, ModelAssessment, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Effect, Model, ModelFile, Timing, find_effect, name_term
@@ -109,7 +109,7 @@ class PreparedRun:
         manifest: the run's results.
         vehicle: vehicle that it was analyzed with.
         run: the run as arrays.
-        problem: the estimation problem.
+        data: the estimation data.
         stage: data of the figures.
         lock: lock for the use of these attributes.
     """
@@ -117,12 +117,12 @@ class PreparedRun:
     manifest: Manifest
     vehicle: Vehicle
     run: MotionRun
-    problem: Problem
+    data: EstimationData
     stage: MotionStage
     lock: threading.RLock = field(default_factory=threading.RLock)
     _fits: OrderedDict[object, Judged] = field(default_factory=OrderedDict)
     _errors: OrderedDict[object, Errors] = field(default_factory=OrderedDict)
-    _second: Problem | None = None
+    _second: EstimationData | None = None
 
     def judge(self, model: Model) -> Judged:
         """Fit a model and score it on held-out data; results are cached.
@@ -132,7 +132,7 @@ class PreparedRun:
         key = model.effects
         with self.lock:
             if key not in self._fits:
-                fitted, held_out = fit_and_hold_out(self.problem, model)
+                fitted, held_out = fit_and_hold_out(self.data, model)
                 estimates = estimate_intervals(fitted) if model.effects else NOTHING
                 self.remember(model, Judged(fitted, held_out, estimates))
             self._fits.move_to_end(key)
@@ -148,20 +148,20 @@ class PreparedRun:
     def apportion(self, model: Model, length_scale_m: float) -> Sequence[SlipBudget]:
         """Budgets by cause of a model, after fitting it; empty for the ideal model."""
         with self.lock:
-            judgement = self._judge_ladder(model)
-            if not judgement.fitted.model.effects:
+            assessment = self._assess_ladder(model)
+            if not assessment.fitted.model.effects:
                 return ()
-            return apportion(judgement, length_scale_m=length_scale_m)
+            return apportion(assessment, length_scale_m=length_scale_m)
 
     def note_fit(self, file: ModelFile) -> ModelFile:
         """A model file with the data of its fit to this run, if a fit to it gives these values."""
         with self.lock:
-            noted = note_fit(file, self._judge_ladder(file.model))
+            noted = note_fit(file, self._assess_ladder(file.model))
             return noted if _list_keys(noted.model) == _list_keys(file.model) else file
 
-    def _judge_ladder(self, model: Model) -> Judgement:
+    def _assess_ladder(self, model: Model) -> ModelAssessment:
         whole = self.judge(model)
-        return Judgement(self.problem, whole.ladder_step, whole.estimates)
+        return ModelAssessment(self.data, whole.ladder_step, whole.estimates)
 
     def measure_errors(self, model: Model) -> Errors:
         """Held-out errors of a model, fitted as `judge` does; without intervals."""
@@ -170,7 +170,7 @@ class PreparedRun:
             if key in self._fits:
                 return self._fits[key].errors
             if key not in self._errors:
-                self._errors[key] = fit_and_hold_out(self.problem, model)[1].pooled
+                self._errors[key] = fit_and_hold_out(self.data, model)[1].pooled
                 while len(self._errors) > _MOST_FITS:
                     self._errors.popitem(last=False)
             return self._errors[key]
@@ -179,16 +179,16 @@ class PreparedRun:
         """Errors of a model with its present values: held out where a fit gave these, else as they are."""
         with self.lock:
             known = self.find_fit(model)
-            return score(self.problem, self.state(model, timing)).pooled if known is None else known.errors
+            return score(self.data, self.state(model, timing)).pooled if known is None else known.errors
 
     def find_fit(self, model: Model) -> Judged | None:
         """The known fit that gave a model its present values; None if none did."""
         known = self._fits.get(model.effects)
         return known if known is not None and _list_keys(known.fitted.model) == _list_keys(model) else None
 
-    def state(self, model: Model, timing: Sequence[float]) -> State:
+    def state(self, model: Model, timing: Sequence[float]) -> ModelState:
         """A model with the recording's delays."""
-        return State(model.effects, (Timing(timing[1]),))
+        return ModelState(model.effects, (Timing(timing[1]),))
 
     def show(
         self,
@@ -200,7 +200,7 @@ class PreparedRun:
         """Prepare a model with its present values for the figures."""
         with self.lock:
             state = self.state(model, timing)
-            whole, comparison = self.problem.whole, self.problem.comparisons[0]
+            whole, run_residuals = self.data.whole, self.data.residuals_by_run[0]
             residual = whole.find_residuals(state)
             regions = map_errors(whole, residual, whole.find_places())
             steps = [read_result(step, results.Step) for step in ladder]
@@ -210,15 +210,15 @@ class PreparedRun:
                 view=view,
                 largest=_find_largest(view, steps[-1], least),
                 where=[describe_region(one) for one in pick_regions(regions, residual, whole.noise)],
-                predict=partial(predict_at_from, comparison, state.effects_of(0), state.timing[0]),
+                predict=partial(predict_at_from, run_residuals, state.effects_of(0), state.timing[0]),
                 apportion=partial(self.apportion, model),
             )
 
-    def second_problem(self) -> Problem:
-        """A second problem of the run, for trials of many effects in the background."""
+    def second_data(self) -> EstimationData:
+        """Second data of the run, for trials of many effects in the background."""
         with self.lock:
             if self._second is None:
-                self._second = Problem([self.run], self.vehicle, self.problem.source)
+                self._second = EstimationData([self.run], self.vehicle, self.data.source)
             return self._second
 
 
@@ -284,11 +284,11 @@ class RunCache:
                 if key in self._prepared:
                     self._prepared.move_to_end(key)
                     return self._prepared[key]
-            problem = Problem([run], vehicle, chosen)
+            data = EstimationData([run], vehicle, chosen)
             places = None
             if "velocities" in manifest.tables:
                 places = manifest.read("velocities").select(pl.col("t", "x", "y")).sort("t")
-            prepared = PreparedRun(manifest, vehicle, run, problem, MotionStage(problem, places))
+            prepared = PreparedRun(manifest, vehicle, run, data, MotionStage(data, places))
             with self._lock:
                 self._prepared[key] = prepared
                 while len(self._prepared) > _MOST_RUNS:
@@ -315,7 +315,7 @@ def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
     Steps that can no longer be opened are dropped.
     """
     session = file.read()
-    source = prepared.problem.source.value
+    source = prepared.data.source.value
     if session is not None and (session.key != prepared.manifest.key or session.input != source):
         session = None
     session = session.move(0) if session is not None else None
@@ -499,14 +499,12 @@ class Editor:
 
     def _explain_refusals(self, whole: Judged, shown: Sequence[str]) -> dict[str, str]:
         """Reasons why effects of a fitted model are refused, by id; earlier reasons are preserved."""
-        step, problem = self.session.step, self.prepared.problem
+        step, data = self.session.step, self.prepared.data
         refusals: dict[str, str] = {}
         if not set(shown) <= set(step.order):
             before = self.prepared.judge(switch_off(self.model, step.off))
-            refusals = explain_refusals(
-                problem, before.ladder_step, whole.ladder_step, lambda: whole.intervals
-            )
-        conditions = problem.conditions
+            refusals = explain_refusals(data, before.ladder_step, whole.ladder_step, lambda: whole.intervals)
+        conditions = data.conditions
         for name in (name for name in shown if name in step.order):
             why = explain_refusal(whole.fitted.model.effect(name), whole.intervals, conditions)
             if why := why or step.refused.get(name):
@@ -544,8 +542,8 @@ def keep_floor(session: Session, prepared: PreparedRun, diagnosis: RunDiagnosis 
     known = None
     if diagnosis is not None:
         paths = {name: one.noise_floor for name, one in diagnosis.by_path.items()}
-        known = {**paths, diagnosis.input: diagnosis.noise_floor}.get(prepared.problem.source.value)
+        known = {**paths, diagnosis.input: diagnosis.noise_floor}.get(prepared.data.source.value)
     floor: dict[str, object] = dict(
-        errors_as_json(estimate_floor(prepared.problem)) if known is None else results.to_json(known)
+        errors_as_json(estimate_floor(prepared.data)) if known is None else results.to_json(known)
     )
     return session if session.floor == floor else msgspec.structs.replace(session, floor=floor)

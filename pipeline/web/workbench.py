@@ -130,7 +130,7 @@ class Trials:
 
 def _key(prepared: PreparedRun, model: Model) -> tuple[object, ...]:
     manifest = prepared.manifest
-    return (manifest.run, manifest.key, prepared.problem.source.value, model.effects)
+    return (manifest.run, manifest.key, prepared.data.source.value, model.effects)
 
 
 def _try_all(prepared: PreparedRun, model: Model, trial: Trial, idle: threading.Event) -> None:
@@ -144,7 +144,7 @@ def _try_all(prepared: PreparedRun, model: Model, trial: Trial, idle: threading.
 
 def _try_each(prepared: PreparedRun, model: Model, trial: Trial, idle: threading.Event) -> None:
     idle.wait()
-    tries = Tries(prepared.second_problem(), model)
+    tries = Tries(prepared.second_data(), model)
     trial.total, additions = len(tries.candidates), list[Addition]()
     for addition in tries.try_each():
         additions += [] if addition is None else [addition]
@@ -182,7 +182,7 @@ def rank_offers(editor: Editor, diagnosis: RunDiagnosis | None) -> list[dict[str
     missing = (one for one in editor.diagnosed if one.id not in step.order)
     sound = Model(prepared.vehicle, tuple(one for one in missing if explain_refusal(one, intervals) is None))
     with prepared.lock:
-        offered = prepared.problem.active_effects(sound)
+        offered = prepared.data.active_effects(sound)
         before = prepared.score(switch_off(editor.model, step.off), step.timing)
         model = switch_off(editor.begin(editor.model), step.off)
         ranked = rank_named(prepared.measure_errors, model, before, offered)

@@ -14,10 +14,10 @@ from motion_runs import as_run, make_scenario, simulate, vehicle_of
 from pipeline.estimation import Input
 from pipeline.estimation.ambiguity import find_undecided
 from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, measure_t
-from pipeline.estimation.fit import fit_part, make_folds
-from pipeline.estimation.intervals import estimate_part
-from pipeline.estimation.problem import prepare_problem
-from pipeline.estimation.state import State
+from pipeline.estimation.estimation_data import prepare_data
+from pipeline.estimation.fit import fit_path, make_folds
+from pipeline.estimation.intervals import estimate_path
+from pipeline.estimation.model_state import ModelState
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Timing, find_effect
 from pipeline.simulate import Disturbance, Encoders, Program, simulate_run
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from pipeline.estimation.decision import SearchResult
-    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.fit import PathFit
     from pipeline.models import Effect
     from pipeline.run import MotionRun
-    from pipeline.simulate import State as Moment
+    from pipeline.simulate import ModelState as Moment
 
 HUSKY = vehicle_of("husky_a200")
 USUAL = Disturbance(0.03, 0.05)
@@ -44,19 +44,19 @@ def drive(effects: object, **more: object) -> MotionRun:
     return simulate(effects, **{**usual, **more})  # type: ignore[arg-type]
 
 
-def search(*runs: MotionRun, names: Collection[str] = ()) -> tuple[Search, SearchResult, State]:
+def search(*runs: MotionRun, names: Collection[str] = ()) -> tuple[Search, SearchResult, ModelState]:
     """The ground searched from the wheels, with candidates of these names or with all; and its start."""
-    problem = prepare_problem(runs, HUSKY, Input.MEASURED)
-    candidates = [one for one in problem.list_candidates(Input.MEASURED) if not names or one.id in names]
-    made = Search(problem.parts[0], tuple(candidates), problem.conditions)
-    start = problem.start_state()
+    data = prepare_data(runs, HUSKY, Input.MEASURED)
+    candidates = [one for one in data.list_candidates(Input.MEASURED) if not names or one.id in names]
+    made = Search(data.paths[0], tuple(candidates), data.conditions)
+    start = data.start_state()
     return made, made.run(start), start
 
 
 def judge_alone(run: MotionRun, effect: Effect) -> Judged:
     """How one effect beside nothing is judged."""
     made, found, start = search(run, names=(effect.id,))
-    return judge(found.start, fit_part(made.part, start.add(effect)), made.conditions)
+    return judge(found.start, fit_path(made.path, start.add(effect)), made.conditions)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -72,7 +72,7 @@ def test_nothing_is_named_where_only_noise_was_drawn(seed: int) -> None:
 def test_a_hidden_track_is_named_with_an_interval_that_holds_it() -> None:
     _, found, _ = search(drive({"effective_track": 1.6}))
     assert found.new == ("effective_track",)
-    number = estimate_part(found.final).find("effective_track.k")
+    number = estimate_path(found.final).find("effective_track.k")
     assert number.low < 1.6 < number.high
     assert number.high - number.low < 0.2
     judged = found.judged["effective_track"]
@@ -107,9 +107,9 @@ def test_what_nobody_would_notice_has_no_name_however_evident_it_is() -> None:
 
 def test_a_lag_that_sampling_makes_has_no_name_and_keeps_a_limit_from_one() -> None:
     run = drive({"drive_lag": 0.02}, encoders=Encoders(rate_hz=20.0, noise_radps=0.003))
-    problem = prepare_problem([run], HUSKY, Input.COMMAND)
-    part, start = problem.parts[1], problem.start_state()
-    found = Search(part, problem.list_drivetrain(), problem.conditions).run(start)
+    data = prepare_data([run], HUSKY, Input.COMMAND)
+    path, start = data.paths[1], data.start_state()
+    found = Search(path, data.list_drivetrain(), data.conditions).run(start)
     assert found.new == ()
     assert found.final.ids == ("drive_lag",)
 
@@ -147,20 +147,20 @@ def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
     speed = np.where(times % 15.0 > 9.0, 0.4 + 0.1 * (times // 15.0), 0.0)
     played = Commands(times, speed, np.zeros(times.size))
     run = drive({"brake_lag": {"tau_drive": 0.3, "tau_brake": 1.5}}, duration_s=90.0, played=played)
-    problem = prepare_problem([run], HUSKY, Input.COMMAND)
-    lags = [one for one in problem.list_candidates(Input.COMMAND) if one.id in {"drive_lag", "brake_lag"}]
-    made = Search(problem.parts[-1], tuple(lags), problem.conditions)
-    one_lag = made.fit(problem.start_state().add(find_effect("drive_lag")(tau=0.9)))
+    data = prepare_data([run], HUSKY, Input.COMMAND)
+    lags = [one for one in data.list_candidates(Input.COMMAND) if one.id in {"drive_lag", "brake_lag"}]
+    made = Search(data.paths[-1], tuple(lags), data.conditions)
+    one_lag = made.fit(data.start_state().add(find_effect("drive_lag")(tau=0.9)))
     whole = made._try_whole(one_lag, next(one for one in lags if one.id == "brake_lag"))
     assert whole is not None
     assert whole.ids == ("brake_lag",)
-    assert estimate_part(whole).find("brake_lag.tau_brake").value == pytest.approx(1.5, abs=0.1)
+    assert estimate_path(whole).find("brake_lag.tau_brake").value == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_fit_that_ends_early_or_holds_a_number_is_not_taken_for_another_one() -> None:
-    problem = prepare_problem([drive({"effective_track": 1.3}, duration_s=60.0)], HUSKY, Input.COMMAND)
-    made = Search(problem.parts[0], (), problem.conditions)
-    start, track = problem.start_state(), find_effect("effective_track")(k=1.05)
+    data = prepare_data([drive({"effective_track": 1.3}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    made = Search(data.paths[0], (), data.conditions)
+    start, track = data.start_state(), find_effect("effective_track")(k=1.05)
     early = made.fit(start.add(track), -1e9)
     assert made.fit(start.add(track.fix("k"))).numbers < early.numbers
     assert made.fit(start.add(track)).score < early.score - 100.0
@@ -169,11 +169,11 @@ def test_a_fit_that_ends_early_or_holds_a_number_is_not_taken_for_another_one() 
 
 def test_a_companion_without_a_start_in_its_bounds_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured wheels that exceed all starts of a limit leave it none."""
-    problem = prepare_problem([drive({}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    data = prepare_data([drive({}, duration_s=60.0)], HUSKY, Input.COMMAND)
     limit = find_effect("turn_acceleration_limit")
-    made = Search(problem.parts[-1], (limit,), problem.conditions)
+    made = Search(data.paths[-1], (limit,), data.conditions)
     monkeypatch.setattr("pipeline.estimation.decision.list_starts", lambda *_: [])
-    assert made._try_beside(made.fit(problem.start_state()), limit) is None
+    assert made._try_beside(made.fit(data.start_state()), limit) is None
 
 
 def test_a_refusal_says_why() -> None:
@@ -202,8 +202,8 @@ def test_a_limit_counts_by_its_inverse_and_several_numbers_cost_evidence() -> No
     limit, change = find_effect("body_speed_limit")(limit=2.0), find_effect("side_lag")
     sides = change(tau_left=0.3, tau_right=0.4)
 
-    def make_fit(effect: Effect, *errors: float) -> PartFit:
-        state = State((effect,), (Timing(),))
+    def make_fit(effect: Effect, *errors: float) -> PathFit:
+        state = ModelState((effect,), (Timing(),))
         free = tuple(number for number in state.list_free(()) if number.effect)
         return SimpleNamespace(free=free, state=state, covariance=np.diag(np.square(errors)))  # type: ignore[return-value]
 
@@ -214,9 +214,9 @@ def test_a_limit_counts_by_its_inverse_and_several_numbers_cost_evidence() -> No
 
 def test_blocks_are_held_out_of_one_run_and_runs_of_three() -> None:
     runs = [drive({}, seed=seed, duration_s=45.0) for seed in range(3)]
-    one = search(runs[0], names=("effective_track",))[0].part
+    one = search(runs[0], names=("effective_track",))[0].path
     assert [np.unique(make_folds(one)[one.block == block]).size for block in range(int(one.block.max()) + 1)]
-    three = search(*runs, names=("effective_track",))[0].part
+    three = search(*runs, names=("effective_track",))[0].path
     folds = make_folds(three)
     assert all(np.unique(folds[three.run == run]).size == 1 for run in range(3))
     assert np.unique(folds).size == 3

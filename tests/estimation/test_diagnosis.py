@@ -17,8 +17,8 @@ from pipeline.core import NORMAL_95
 from pipeline.estimation import (
     Diagnosis,
     Estimates,
+    EstimationData,
     Input,
-    Problem,
     Recording,
     diagnose_runs,
     load_recording,
@@ -27,7 +27,7 @@ from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.ladder import judge_whole
-from pipeline.estimation.state import Free
+from pipeline.estimation.model_state import Free
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
@@ -231,8 +231,8 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     formula = read_model(model).model
     assert formula.ids == ("suggested_term",)
     # What it is said to bring is what the model has with it.
-    problem = Problem([load_recording(recording, vehicle)], vehicle, Input(run.input))
-    whole = judge_whole(problem, proposal.model + formula.effect("suggested_term"))
+    data = EstimationData([load_recording(recording, vehicle)], vehicle, Input(run.input))
+    whole = judge_whole(data, proposal.model + formula.effect("suggested_term"))
     assert left.with_formula == read_result(errors_as_json(whole.errors), Errors)
     before, after = (one.velocity_rms[0] for one in (run.ladder[-1], left.with_formula))
     assert after < 0.7 * before  # type: ignore[operator]

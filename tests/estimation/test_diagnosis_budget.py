@@ -12,8 +12,8 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core.compute import usual_budget
 from pipeline.estimation import diagnose_runs, parse_budget
+from pipeline.estimation.estimation_data import DiagnosisError
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.problem import DiagnosisError
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.words.diagnosis import describe
 from pipeline.words.verdict import format_verdict

@@ -10,7 +10,15 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Comparison, Errors, Input, Problem, diagnose_runs, fit_model, load_recording
+from pipeline.estimation import (
+    Errors,
+    EstimationData,
+    Input,
+    RunResiduals,
+    diagnose_runs,
+    fit_model,
+    load_recording,
+)
 from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.plausibility import list_implausible
 from pipeline.estimation.stored_diagnosis import read_recording
@@ -94,10 +102,8 @@ class Asked:
 
     def fit(self, name: str, source: str, ids: Sequence[str]) -> Model:
         vehicle, run = self._load(name)
-        problem = Problem([run], vehicle, Input(source))
-        return fit_model(
-            problem, Model(vehicle, tuple(find_effect(each)() for each in ids)), exact=True
-        ).model
+        data = EstimationData([run], vehicle, Input(source))
+        return fit_model(data, Model(vehicle, tuple(find_effect(each)() for each in ids)), exact=True).model
 
     def _load(self, name: str) -> tuple[Vehicle, MotionRun]:
         options = Options(out=self.results, report=False, diagnosis=False)
@@ -107,10 +113,10 @@ class Asked:
     def measure_as_recorded(self, name: str) -> Errors:
         """Errors of the ideal model on measured wheels, on the clocks as they were recorded."""
         vehicle, run = self._load(name)
-        comparison = Comparison(run, vehicle, Input.MEASURED)
+        run_residuals = RunResiduals(run, vehicle, Input.MEASURED)
         timing, late = Timing(-run.alignment.wheel_delay_s), -run.alignment.heading_delay_s
-        reached = comparison.find_horizon_errors((), timing, late)
-        return measure_errors(comparison.find_residuals((), timing, late), reached.position, reached.yaw)
+        reached = run_residuals.find_horizon_errors((), timing, late)
+        return measure_errors(run_residuals.find_residuals((), timing, late), reached.position, reached.yaw)
 
 
 @pytest.fixture(scope="module")

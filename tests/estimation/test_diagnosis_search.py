@@ -9,11 +9,11 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Input, Problem, fit_model, load_recording
+from pipeline.estimation import EstimationData, Input, fit_model, load_recording
 from pipeline.estimation.decision import Search
-from pipeline.estimation.fit import fit_part
-from pipeline.estimation.parts import BodyPart
-from pipeline.estimation.problem import prepare_problem
+from pipeline.estimation.estimation_data import prepare_data
+from pipeline.estimation.fit import fit_path
+from pipeline.estimation.path_residuals import BodyResiduals
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.estimation.candidates import Candidate
-    from pipeline.estimation.state import State
+    from pipeline.estimation.model_state import ModelState
     from pipeline.models import Effect
     from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
@@ -58,16 +58,18 @@ def _load(scenario: Scenario, folder: Path) -> tuple[MotionRun, Vehicle]:
     return load_recording(recording, vehicle), vehicle
 
 
-def _prepare(scenario: Scenario, folder: Path) -> Problem:
+def _prepare(scenario: Scenario, folder: Path) -> EstimationData:
     run, vehicle = _load(scenario, folder)
-    return prepare_problem([run], vehicle, Input.COMMAND)
+    return prepare_data([run], vehicle, Input.COMMAND)
 
 
-def _search(problem: Problem, effects: Sequence[Effect], candidates: Sequence[Candidate] = ()) -> State:
+def _search(
+    data: EstimationData, effects: Sequence[Effect], candidates: Sequence[Candidate] = ()
+) -> ModelState:
     """What a search of the drivetrain names that begins at a model."""
-    candidates = candidates or problem.list_drivetrain()
-    search = Search(problem.parts[1], tuple(candidates), problem.conditions)
-    found = search.run(problem.start_state(effects))
+    candidates = candidates or data.list_drivetrain()
+    search = Search(data.paths[1], tuple(candidates), data.conditions)
+    found = search.run(data.start_state(effects))
     return found.final.state.hold([one for one in found.final.state.effects if one.id in found.new])
 
 
@@ -80,8 +82,8 @@ def _give(name: str, value: float) -> Effect:
 def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(tmp_path: Path) -> None:
     """Neither lag helps beside the delay alone, and beside both lags the limits are never reached."""
     names = ("body_speed_limit", "body_turn_limit", "transport_delay", "steering_gain")
-    problem = _prepare(_CAR, tmp_path / "car")
-    found = _search(problem, [find_effect(name)().make_usual(problem.largest) for name in names])
+    data = _prepare(_CAR, tmp_path / "car")
+    found = _search(data, [find_effect(name)().make_usual(data.largest) for name in names])
     assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
 
 
@@ -89,9 +91,9 @@ def test_a_delay_beside_limits_is_found_from_the_wrong_hollow_of_the_loss(tmp_pa
     """A descent from a delay that had stood for the limits, too, ends with .6 s and limits that never act."""
     true = {"transport_delay": 0.34, "body_acceleration_limit": 1.5, "turn_acceleration_limit": 1.5}
     scenario = replace(_CAR, vehicle=VEHICLES["husky"], effects=true, program=Program("drive_steps"))
-    problem = _prepare(replace(scenario, duration_s=90.0), tmp_path / "husky")
+    data = _prepare(replace(scenario, duration_s=90.0), tmp_path / "husky")
     wrong = {"transport_delay": 0.7, "body_acceleration_limit": 15.0, "turn_acceleration_limit": 15.0}
-    found = _search(problem, [_give(*one) for one in wrong.items()])
+    found = _search(data, [_give(*one) for one in wrong.items()])
     assert {e.id: next(iter(e.values.values())) for e in found.effects} == pytest.approx(true, rel=0.05)
 
 
@@ -103,10 +105,10 @@ def test_a_dead_time_and_a_limited_torque_take_the_place_of_a_lag_and_a_ramp(tmp
         "effective_track": 1.8,
     }
     scenario = Scenario(vehicle=VEHICLES["husky"], effects=effects, duration_s=60.0, seed=112)
-    problem = _prepare(scenario, tmp_path / "husky")
-    whole = BodyPart(problem.comparisons)
-    search = Search(whole, problem.list_candidates(Input.COMMAND), problem.conditions)
-    assert set(search.run(problem.start_state()).new) == set(effects)
+    data = _prepare(scenario, tmp_path / "husky")
+    whole = BodyResiduals(data.residuals_by_run)
+    search = Search(whole, data.list_candidates(Input.COMMAND), data.conditions)
+    assert set(search.run(data.start_state()).new) == set(effects)
 
 
 def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -> None:
@@ -118,9 +120,9 @@ def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -
         program=Program("drive_steps", speed_scale=1.2, turn_scale=1.2),
         duration_s=90.0,
     )
-    problem = _prepare(scenario, tmp_path / "husky")
+    data = _prepare(scenario, tmp_path / "husky")
     wrong = {"drive_gain": 0.9, "body_speed_limit": 0.6}
-    (found,) = _search(problem, [_give(*one) for one in wrong.items()]).effects
+    (found,) = _search(data, [_give(*one) for one in wrong.items()]).effects
     assert found.id == "wheel_speed_scaling"
     assert found.values["limit"] == pytest.approx(4.0, rel=0.02)
 
@@ -138,9 +140,9 @@ def test_a_run_without_a_usable_gyro_leaves_the_clock_of_another_run_free(tmp_pa
         )
         run, vehicle = _load(scenario, tmp_path / name)
         runs.append(run)
-    problem = Problem(runs, vehicle, Input.MEASURED)
-    assert [comparison.has_gyro for comparison in problem.comparisons] == [False, True]
-    fitted = fit_model(problem, Model(vehicle, (find_effect("body_inertia")(),)))
+    data = EstimationData(runs, vehicle, Input.MEASURED)
+    assert [run_residuals.has_gyro for run_residuals in data.residuals_by_run] == [False, True]
+    fitted = fit_model(data, Model(vehicle, (find_effect("body_inertia")(),)))
     (effect,) = fitted.state.effects
     assert effect.values["tau"] == pytest.approx(0.52, abs=0.004)
 
@@ -166,17 +168,17 @@ def test_two_lags_of_a_car_are_found_together(tmp_path: Path) -> None:
 def test_effects_of_which_either_will_do_are_not_both_dropped(tmp_path: Path) -> None:
     """Where nothing but turning on the spot was driven, radius and track are one number."""
     scenario = replace(_HUSKY, effects={"wheel_radius": 0.85}, program=Program("spins"))
-    problem = _prepare(scenario, tmp_path / "husky")
+    data = _prepare(scenario, tmp_path / "husky")
     names = ("wheel_radius", "effective_track")
-    both = [find_effect(name)().make_usual(problem.largest) for name in names]
-    search = Search(problem.parts[0], (), problem.conditions)
-    assert len(search.run(problem.start_state(both)).new) == 1
+    both = [find_effect(name)().make_usual(data.largest) for name in names]
+    search = Search(data.paths[0], (), data.conditions)
+    assert len(search.run(data.start_state(both)).new) == 1
 
 
 def test_an_effect_that_acts_beside_another_one_alone_is_no_candidate_without_it(tmp_path: Path) -> None:
-    problem = _prepare(replace(_HUSKY, effects={"drive_lag": 0.4}), tmp_path / "husky")
-    search = Search(problem.parts[1], problem.list_drivetrain(), problem.conditions)
-    fit = fit_part(search.part, problem.start_state([_give("drive_lag", 0.4)]))
+    data = _prepare(replace(_HUSKY, effects={"drive_lag": 0.4}), tmp_path / "husky")
+    search = Search(data.paths[1], data.list_drivetrain(), data.conditions)
+    fit = fit_path(search.path, data.start_state([_give("drive_lag", 0.4)]))
     assert "motor_imbalance" in {one.id for one in search.candidates}
     assert "motor_imbalance" not in {trial.effect.id for trial in search.screen(fit).trials}
     assert find_effect("motor_imbalance")().acts_in(("wheel_servo",))

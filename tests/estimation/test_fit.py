@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem, fit_model
-from pipeline.estimation.fit import fit_part, hold_out, make_folds
+from pipeline.estimation import EstimationData, Input, fit_model
+from pipeline.estimation.fit import fit_path, hold_out, make_folds
 from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.model_file import parse_model
 from pipeline.simulate import Disturbance, Program
@@ -32,46 +32,46 @@ STARTS = (
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
+def data() -> EstimationData:
     run = simulate(TRUTH, duration_s=60.0, program=Program("teleop"), disturbance=Disturbance(0.03, 0.05))
-    return Problem([run], HUSKY, Input.COMMAND)
+    return EstimationData([run], HUSKY, Input.COMMAND)
 
 
 def read_values(model: Model) -> dict[str, float]:
     return {f"{effect.id}.{name}": value for effect in model for name, value in effect.values.items()}
 
 
-def test_an_exact_fit_ends_at_the_same_values_from_every_start(problem: Problem) -> None:
-    ends = [read_values(fit_model(problem, Model(HUSKY, start), exact=True).model) for start in STARTS]
+def test_an_exact_fit_ends_at_the_same_values_from_every_start(data: EstimationData) -> None:
+    ends = [read_values(fit_model(data, Model(HUSKY, start), exact=True).model) for start in STARTS]
     for other in ends[1:]:
         # One unit in the last of the six digits that a file keeps.
         assert other == pytest.approx(ends[0], rel=1e-5, abs=2e-6)
     assert ends[0]["drive_lag.tau"] == pytest.approx(0.3, abs=0.01)
 
 
-def test_the_fit_of_a_written_model_is_the_model(problem: Problem) -> None:
-    fitted = fit_model(problem, Model(HUSKY, STARTS[0]), exact=True)
+def test_the_fit_of_a_written_model_is_the_model(data: EstimationData) -> None:
+    fitted = fit_model(data, Model(HUSKY, STARTS[0]), exact=True)
     written = parse_model(format_model(ModelFile(fitted.model)), "model.toml").model
     assert written == fitted.model
     # Also where nothing is remembered.
-    fresh = Problem(problem.runs, HUSKY, Input.COMMAND)
+    fresh = EstimationData(data.runs, HUSKY, Input.COMMAND)
     again = read_values(fit_model(fresh, written, exact=True).model)
     assert again == pytest.approx(read_values(written), rel=2e-6, abs=2e-6)
 
 
-def test_numbers_stay_within_their_bounds(problem: Problem) -> None:
+def test_numbers_stay_within_their_bounds(data: EstimationData) -> None:
     """Nothing skids, so that a number from near a bound moves away from it."""
     skid = find_effect("lateral_skid")
     low, high = skid.parameters[0].bounds
     for start in (0.9 * low, 0.9 * high):
-        fitted = fit_model(problem, Model(HUSKY, (*STARTS[1], skid(c=start))))
+        fitted = fit_model(data, Model(HUSKY, (*STARTS[1], skid(c=start))))
         assert low <= fitted.model.effect("lateral_skid").values["c"] <= high
 
 
-def test_what_is_held_out_is_what_a_fit_without_it_leaves(problem: Problem) -> None:
-    part = problem.parts[0]
-    fit = fit_part(part, problem.start_state([find_effect("effective_track")(k=1.6)]))
-    folds = make_folds(part)
+def test_what_is_held_out_is_what_a_fit_without_it_leaves(data: EstimationData) -> None:
+    path = data.paths[0]
+    fit = fit_path(path, data.start_state([find_effect("effective_track")(k=1.6)]))
+    folds = make_folds(path)
     held = hold_out(fit, fit.noise, folds)
     # Each fold by one step of the numbers, to those that the others ask for.
     assert held.shape == fit.residual.shape
@@ -88,11 +88,11 @@ def test_what_is_held_out_is_what_a_fit_without_it_leaves(problem: Problem) -> N
     assert np.mean(held[:, 2] ** 2) > np.mean(fit.residual[:, 2] ** 2)
 
 
-def test_a_limit_that_does_little_stays_a_limit_in_one_step(problem: Problem) -> None:
+def test_a_limit_that_does_little_stays_a_limit_in_one_step(data: EstimationData) -> None:
     """A step of several times its value goes to where it does a few times as much, not to nothing at all."""
     limit = find_effect("wheel_speed_limit")(limit=18.0)
-    state = problem.start_state([limit])
-    (number,) = (one for one in problem.parts[0].list_free(state) if one.effect == limit.id)
+    state = data.start_state([limit])
+    (number,) = (one for one in data.paths[0].list_free(state) if one.effect == limit.id)
     assert state.move([number], [-30.0]).get(number) == pytest.approx(18.0 / (1.0 + 30.0 / 18.0))
     assert state.move([number], [1.0]).get(number) == pytest.approx(18.0 / (1.0 - 1.0 / 18.0))
     assert state.move([number], [60.0]).get(number) == number.bounds[1]
@@ -109,7 +109,7 @@ def test_each_ground_has_its_own_numbers_and_the_vehicle_one() -> None:
         for seed, (terrain, truth) in enumerate(truths)
     ]
     model = Model(HUSKY, (find_effect("wheel_asymmetry")(), find_effect("speed_slip")()))
-    state = fit_model(Problem(runs, HUSKY, Input.MEASURED), model).state
+    state = fit_model(EstimationData(runs, HUSKY, Input.MEASURED), model).state
     numbers = [{one.id: next(iter(one.values.values())) for one in state.effects_of(run)} for run in range(3)]
     for found, (_, truth) in zip(numbers, truths, strict=True):
         assert found == pytest.approx(truth, abs=0.01)
@@ -117,5 +117,5 @@ def test_each_ground_has_its_own_numbers_and_the_vehicle_one() -> None:
     assert numbers[0]["wheel_asymmetry"] == numbers[1]["wheel_asymmetry"]
     # On one ground they share all.
     alike = [replace(run, terrain="tile") for run in runs]
-    shared = fit_model(Problem(alike, HUSKY, Input.MEASURED), model).state
+    shared = fit_model(EstimationData(alike, HUSKY, Input.MEASURED), model).state
     assert shared.effects_of(0) == shared.effects_of(1)

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 import pytest
 from motion_runs import WANDERING, simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem
+from pipeline.estimation import EstimationData, Input
 from pipeline.estimation.errors import Errors
-from pipeline.estimation.ladder import judge_model
+from pipeline.estimation.ladder import assess_model
 from pipeline.models import Model, find_effect
 from pipeline.simulate import Disturbance, PoseSensor, Program
 
@@ -38,7 +38,7 @@ def _judge(
         TRUTH, seed=seed, duration_s=duration_s, pose=pose, disturbance=disturbance, program=program
     )
     model = Model(HUSKY, tuple(find_effect(name)() for name in effects))
-    judged = judge_model(Problem([run], HUSKY, Input.COMMAND), model)
+    judged = assess_model(EstimationData([run], HUSKY, Input.COMMAND), model)
     return judged.floor, judged.whole.errors
 
 
@@ -72,7 +72,7 @@ def test_trials_of_seconds_have_a_floor_together() -> None:
         for seed in range(4)
     ]
     model = Model(HUSKY, tuple(find_effect(name)() for name in TRUTH))
-    judged = judge_model(Problem(runs, HUSKY, Input.COMMAND), model)
+    judged = assess_model(EstimationData(runs, HUSKY, Input.COMMAND), model)
     assert all(math.isfinite(value) for value in (*judged.floor.velocity_rms, *judged.floor.velocity_spread))
     assert 0.5 * judged.whole.errors.t_mrmse_m < judged.floor.t_mrmse_m < judged.whole.errors.t_mrmse_m
     # Half a minute of turning tells noise from what the input does within a factor of three.

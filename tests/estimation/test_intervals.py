@@ -11,7 +11,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 from msgspec.structs import replace
 
-from pipeline.estimation import Estimates, Fitted, Input, Problem, estimate_intervals, fit_model
+from pipeline.estimation import Estimates, EstimationData, Fitted, Input, estimate_intervals, fit_model
 from pipeline.estimation.ambiguity import DETECTED, _find_detectable
 from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.fit import invert
@@ -20,7 +20,7 @@ from pipeline.results.reading import DETECTED_SHARE
 from pipeline.simulate import Disturbance, Program
 
 if TYPE_CHECKING:
-    from pipeline.estimation.parts import Part
+    from pipeline.estimation.path_residuals import PathResiduals
     from pipeline.simulate import State
 
 HUSKY = vehicle_of("husky_a200")
@@ -30,18 +30,18 @@ def fit(effects: object, *names: str, **more: object) -> Fitted:
     usual = {"duration_s": 60.0, "program": Program("teleop"), "disturbance": Disturbance(0.03, 0.05)}
     run = simulate(effects, **{**usual, **more})  # type: ignore[arg-type]
     model = Model(HUSKY, tuple(find_effect(name)() for name in names))
-    return fit_model(Problem([run], HUSKY, Input.MEASURED), model, exact=True)
+    return fit_model(EstimationData([run], HUSKY, Input.MEASURED), model, exact=True)
 
 
 def test_errors_of_clocks_are_carried_into_the_numbers_that_they_move(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fitted = fit({"effective_track": 1.7}, "effective_track", "lateral_skid")
-    part: Part = fitted.fits[0].part
-    assert (part.list_clock_errors() > 0.0).all()
+    path: PathResiduals = fitted.fits[0].path
+    assert (path.list_clock_errors() > 0.0).all()
 
     def estimate(error_s: float) -> Estimates:
-        monkeypatch.setattr(part, "list_clock_errors", lambda: np.array([error_s]))
+        monkeypatch.setattr(path, "list_clock_errors", lambda: np.array([error_s]))
         return estimate_intervals(fitted)
 
     exact, usual, poor = (estimate(error) for error in (0.0, 0.02, 0.1))
@@ -64,7 +64,9 @@ def test_errors_of_a_track_that_was_estimated_are_carried() -> None:
     def estimate(errors: dict[str, float]) -> Estimates:
         vehicle = replace(HUSKY, errors=errors)
         model = Model(vehicle, (find_effect("effective_track")(),))
-        return estimate_intervals(fit_model(Problem([run], vehicle, Input.MEASURED), model, exact=True))
+        return estimate_intervals(
+            fit_model(EstimationData([run], vehicle, Input.MEASURED), model, exact=True)
+        )
 
     known, estimated = estimate({}), estimate({"track_width_m": 0.01 * (HUSKY.track_width_m or 1.0)})
     exact, carried = (one.find("effective_track.k") for one in (known, estimated))

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
-from pipeline.estimation.ladder import judge_model
+from pipeline.estimation import Diagnosis, EstimationData, Input, carry_over, diagnose_runs, load_recording
+from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import read_model, write_model
 from pipeline.results import Value
@@ -93,7 +93,7 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
     write_model(proposal, path)
     file = read_model(path)
     assert file.per_run == ("clock_offset.d",)
-    judged = judge_model(Problem(runs, vehicle, Input.COMMAND), file.model, per_run=file.per_run)
+    judged = assess_model(EstimationData(runs, vehicle, Input.COMMAND), file.model, per_run=file.per_run)
     own = {item.free.runs: item for item in judged.estimates.items if item.free.effect == "clock_offset"}
     for number, run in enumerate(diagnosis.runs):
         (told_d,) = next(e.parameters.values() for e in run.effects if e.id == "clock_offset")
@@ -113,5 +113,5 @@ def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: P
     run = load_recording(recording, vehicle)
     blind = replace(run, alignment=replace(run.alignment, gyro=None))
     for runs, clocks in (([blind], ()), ([run, run], ()), ([run, blind], ("clock_offset",))):
-        problem = Problem(runs, vehicle, Input.COMMAND)
-        assert all(part.clocks == clocks for part in problem.parts)
+        data = EstimationData(runs, vehicle, Input.COMMAND)
+        assert all(path.clocks == clocks for path in data.paths)

@@ -14,10 +14,10 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Input, Problem, carry_over, diagnose_runs, load_recording
+from pipeline.estimation import EstimationData, Input, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import parameters_as_json
-from pipeline.estimation.ladder import judge_model, ladder_as_json
+from pipeline.estimation.ladder import assess_model, ladder_as_json
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import view_diagnosis
@@ -83,7 +83,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     check_written(told, file, describe(diagnosis.runs, everything=True))
     check_page(told, describe(diagnosis.runs), describe(diagnosis.runs, everything=True))
     own = check_model_verbs(
-        told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
+        told, file, EstimationData([load_recording(recording, vehicle)], file.model.vehicle, source)
     )
     require_no_rise(told["ladder"])
     if file.model.effects:
@@ -141,9 +141,9 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
         assert re.search(rf"{name} = {shown}(?![\d.])", screen), (effect, name)
 
 
-def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
+def check_model_verbs(told: Json, file: ModelFile, data: EstimationData) -> Json:
     """What the model verbs find on the run is what was written; returns the errors of the whole model."""
-    judged = judge_model(problem, file.model)
+    judged = assess_model(data, file.model)
     found: Json = parameters_as_json(judged.fitted.model, judged.estimates)
     for effect, name, number in list_numbers(told):
         entry = found[f"{effect}.{name}"]
@@ -152,7 +152,7 @@ def check_model_verbs(told: Json, file: ModelFile, problem: Problem) -> Json:
             assert same(number[end], entry[end]), (effect, name, end)
     floor = errors_as_json(judged.floor)
     ladder = ladder_as_json(judged.ladder, judged.floor)
-    (carried,) = carry_over(file.model, list(problem.runs), problem.source)
+    (carried,) = carry_over(file.model, list(data.runs), data.source)
     ideal, own = errors_as_json(carried.ideal.pooled), errors_as_json(carried.own.pooled)
     for key in ERRORS:
         assert same(told["ladder"][0][key], ladder[0][key])

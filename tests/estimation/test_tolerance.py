@@ -10,7 +10,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import ask_verb, print_verb, run_verb
 
-from pipeline.estimation.comparison import Input
+from pipeline.estimation.run_residuals import Input
 from pipeline.estimation.tolerance import Answer, Samples, find_speed_limit, gather_samples, limit_speeds
 from pipeline.models import Model, ModelFile, find_effect
 from pipeline.run import MotionError

@@ -10,9 +10,9 @@ from game.true_model import build_true
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
+from pipeline.estimation import EstimationData, Input, fit_model, hold_out, load_recording
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.ladder import judge_model
+from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, find_effect
 from pipeline.simulate import simulate_case
@@ -32,10 +32,10 @@ def _compare(category: str, seed: int, folder: Path) -> np.ndarray:
     manifest = analyze_log(log, Options(out=folder / "out", report=False)).manifest
     vehicle, recording = read_recording(manifest)
     run = load_recording(recording, vehicle)
-    problem = Problem([run], vehicle, Input.COMMAND)
+    data = EstimationData([run], vehicle, Input.COMMAND)
     true = build_true(riddle.answer, run.duration_s)
-    left = hold_out(problem, fit_model(problem, Model(problem.vehicle, true))).pooled
-    return np.array(estimate_floor(problem).ratios(left))
+    left = hold_out(data, fit_model(data, Model(data.vehicle, true))).pooled
+    return np.array(estimate_floor(data).ratios(left))
 
 
 @pytest.mark.long
@@ -53,9 +53,9 @@ def _measure_floor(effects: dict[str, dict[str, float]], folder: Path) -> float:
     log = simulate_case("ideal_husky", effects, out=folder / "log.mcap", duration_s=180.0, seed=1)
     options = Options(out=folder / "out", report=False, diagnosis=False)
     vehicle, recording = read_recording(analyze_log(log, options).manifest)
-    problem = Problem([load_recording(recording, vehicle)], vehicle, Input.COMMAND)
-    model = Model(problem.vehicle, tuple(find_effect(name)() for name in effects))
-    return judge_model(problem, model).floor.r_mrmse_rad
+    data = EstimationData([load_recording(recording, vehicle)], vehicle, Input.COMMAND)
+    model = Model(data.vehicle, tuple(find_effect(name)() for name in effects))
+    return assess_model(data, model).floor.r_mrmse_rad
 
 
 def test_a_ground_that_changes_half_way_does_not_change_the_noise_floor(tmp_path: Path) -> None:

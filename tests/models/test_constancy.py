@@ -6,9 +6,9 @@ import polars as pl
 import pytest
 from motion_runs import align, extract, make_scenario, vehicle_of
 
-from pipeline.estimation import Input, Problem
+from pipeline.estimation import EstimationData, Input
 from pipeline.estimation.constancy import find_change
-from pipeline.estimation.ladder import Judgement, judge_model
+from pipeline.estimation.ladder import ModelAssessment, assess_model
 from pipeline.models import Model, find_effect
 from pipeline.results import Errors, RunDiagnosis, Step
 from pipeline.results.reading import CHANGE
@@ -22,7 +22,7 @@ PAUSE_S = 5.0
 Effects = dict[str, dict[str, float]]
 
 
-def judge(halves: tuple[Effects, Effects], seed: int, lengths_s: tuple[float, float]) -> Judgement:
+def judge(halves: tuple[Effects, Effects], seed: int, lengths_s: tuple[float, float]) -> ModelAssessment:
     """A run in two stretches, each with its own physics, fitted with the effects of the first."""
     tables: dict[str, list[pl.DataFrame]] = {}
     for number, (effects, length_s) in enumerate(zip(halves, lengths_s, strict=True)):
@@ -39,7 +39,7 @@ def judge(halves: tuple[Effects, Effects], seed: int, lengths_s: tuple[float, fl
     joined = {name: pl.concat(parts) for name, parts in tables.items()}
     run = load_run(align(joined, HUSKY), HUSKY, name="two parts")
     model = Model(HUSKY, tuple(find_effect(name)() for name in halves[0]))
-    return judge_model(Problem([run], HUSKY, Input.COMMAND), model)
+    return assess_model(EstimationData([run], HUSKY, Input.COMMAND), model)
 
 
 @pytest.mark.parametrize(

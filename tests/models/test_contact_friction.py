@@ -9,9 +9,9 @@ import pytest
 from motion_runs import QUIET, simulate, vehicle_of
 from scipy.integrate import solve_ivp
 
-from pipeline.estimation import Input, Problem, fit_model
-from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.parts import Part
+from pipeline.estimation import EstimationData, Input, fit_model
+from pipeline.estimation.path_residuals import PathResiduals
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model import JointBody
@@ -24,14 +24,14 @@ ICE = {"friction": 0.11, "creep": 0.8, "k": 1.7, "gyration": 1.1}
 HALF = 0.5 * (HUSKY.track_width_m or math.nan)
 
 
-def _compare(rate_hz: float = 50.0) -> Comparison:
+def _compare(rate_hz: float = 50.0) -> RunResiduals:
     run = simulate({}, duration_s=60.0, encoders=None, pose=QUIET, disturbance=Disturbance())
-    return Comparison(run, HUSKY, Input.COMMAND, rate_hz=rate_hz)
+    return RunResiduals(run, HUSKY, Input.COMMAND, rate_hz=rate_hz)
 
 
-def _move(values: dict[str, float], comparison: Comparison) -> np.ndarray:
+def _move(values: dict[str, float], run_residuals: RunResiduals) -> np.ndarray:
     effect = find_effect("contact_friction")().change(**values)
-    velocity = comparison.predict_velocity((effect,), Timing())
+    velocity = run_residuals.predict_velocity((effect,), Timing())
     return np.stack((velocity.x, velocity.y, velocity.w))
 
 
@@ -126,13 +126,13 @@ def test_derivatives_are_the_same_as_of_one_state_after_the_other(
 ) -> None:
     run = simulate({}, duration_s=60.0, pose=QUIET)
     columns = list[np.ndarray]()
-    for look_ahead in (Part.look_ahead, lambda *_: None):
-        monkeypatch.setattr(Part, "look_ahead", look_ahead)
-        problem = Problem([run], HUSKY, Input.COMMAND)
-        (part,) = [part for part in problem.parts if part.owns(find_effect(effects[0])())]
-        state = problem.start_state([find_effect(name)().make_usual(problem.largest) for name in effects])
-        free, residual = part.list_free(state), part.find_residuals(state)
-        columns.append(part.differentiate(state, residual, free, both_sides=both_sides))
+    for look_ahead in (PathResiduals.look_ahead, lambda *_: None):
+        monkeypatch.setattr(PathResiduals, "look_ahead", look_ahead)
+        data = EstimationData([run], HUSKY, Input.COMMAND)
+        (path,) = [path for path in data.paths if path.owns(find_effect(effects[0])())]
+        state = data.start_state([find_effect(name)().make_usual(data.largest) for name in effects])
+        free, residual = path.list_free(state), path.find_residuals(state)
+        columns.append(path.differentiate(state, residual, free, both_sides=both_sides))
     assert np.abs(columns[0]).max() > 0.0
     assert np.array_equal(*columns)
 
@@ -143,10 +143,10 @@ def test_derivatives_are_the_same_as_of_one_state_after_the_other(
 def test_friction_comes_back_from_every_start(friction: float) -> None:
     truth = {**ICE, "friction": friction}
     run = simulate({"contact_friction": truth}, duration_s=150.0)
-    problem = Problem([run], HUSKY, Input.MEASURED)
+    data = EstimationData([run], HUSKY, Input.MEASURED)
     kind = find_effect("contact_friction")
     for start in kind.starts:
-        fitted = fit_model(problem, Model(HUSKY, (kind().change(**start),)))
+        fitted = fit_model(data, Model(HUSKY, (kind().change(**start),)))
         assert fitted.model.effect("contact_friction").values["friction"] == pytest.approx(friction, rel=0.1)
 
 
@@ -155,7 +155,7 @@ def test_effects_of_the_ground_act_on_the_motion_of_the_sliding_body() -> None:
     truth = {"friction": 0.6, "creep": 0.4, "k": 2.0, "gyration": 1.1}
     run = simulate({"contact_friction": truth, "lateral_skid": 0.2}, duration_s=120.0)
     start = Model(HUSKY, (find_effect("contact_friction")().change(**truth), find_effect("lateral_skid")()))
-    fitted = fit_model(Problem([run], HUSKY, Input.MEASURED), start)
+    fitted = fit_model(EstimationData([run], HUSKY, Input.MEASURED), start)
     assert fitted.model.effect("lateral_skid").values["c"] == pytest.approx(0.2, rel=0.1)
 
 

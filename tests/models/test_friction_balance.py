@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from scipy.optimize import fsolve
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation import EstimationData, Input, fit_model
 from pipeline.models import Model, Timing
 from pipeline.models.literature import find_model, list_models
 from pipeline.run import MotionError
@@ -41,19 +41,19 @@ def balance(left: float, right: float, *, base: float, track: float, rolling: fl
 
 
 @pytest.fixture(scope="module")
-def driven() -> Problem:
+def driven() -> EstimationData:
     # Slow enough that the sides often travel opposite ways.
     run = simulate({}, duration_s=60.0, program=Program(speed_scale=0.3))
-    return Problem([run], HUSKY, Input.MEASURED)
+    return EstimationData([run], HUSKY, Input.MEASURED)
 
 
-def predict(problem: Problem, model: Model) -> Floats:
-    velocity = problem.comparisons[0].predict_velocity(model.effects, Timing())
+def predict(data: EstimationData, model: Model) -> Floats:
+    velocity = data.residuals_by_run[0].predict_velocity(model.effects, Timing())
     return np.array((velocity.x, velocity.y, velocity.w))
 
 
 @pytest.mark.parametrize("rolling", [0.02, 0.1, 0.25])
-def test_the_formulas_are_where_forces_and_moment_vanish(driven: Problem, rolling: float) -> None:
+def test_the_formulas_are_where_forces_and_moment_vanish(driven: EstimationData, rolling: float) -> None:
     base, track = HUSKY.wheelbase_m, HUSKY.track_width_m
     assert base is not None
     assert track is not None
@@ -89,8 +89,8 @@ def slip_by_balance(state: SimulatedState) -> tuple[float, float, float]:
 
 
 def test_a_fit_returns_the_share_of_rolling_resistance() -> None:
-    problem = Problem([simulate({}, extra=slip_by_balance, duration_s=120.0)], HUSKY, Input.MEASURED)
-    fitted = fit_model(problem, find_model("friction_based").make(HUSKY), exact=True)
+    data = EstimationData([simulate({}, extra=slip_by_balance, duration_s=120.0)], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, find_model("friction_based").make(HUSKY), exact=True)
     assert fitted.model.effect(TERMS).values["rolling"] == pytest.approx(0.2, abs=0.02)
 
 

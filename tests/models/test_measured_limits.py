@@ -5,8 +5,8 @@ import polars as pl
 import pytest
 from motion_runs import align, extract, make_scenario, simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem
-from pipeline.estimation.parts import WheelPart
+from pipeline.estimation import EstimationData, Input
+from pipeline.estimation.path_residuals import WheelResiduals
 from pipeline.models import Place, find_effect, list_effects
 from pipeline.models.parameter import OVERSHOOT
 from pipeline.run import load_run
@@ -17,12 +17,12 @@ HUSKY = vehicle_of("husky_a200")
 
 def test_a_limit_is_searched_above_what_wheels_exceed() -> None:
     run = simulate({"wheel_speed_limit": 4.0}, duration_s=60.0)
-    problem = Problem([run], HUSKY, Input.COMMAND)
-    assert problem.exceeded["wheel"] == pytest.approx(4.0, rel=0.03)
-    (part,) = (one for one in problem.parts if isinstance(one, WheelPart))
-    (number,) = part.list_free(problem.start_state([find_effect("wheel_speed_limit")(limit=4.0)]))
-    assert number.bounds[0] == pytest.approx(problem.exceeded["wheel"] / OVERSHOOT)
-    (lag,) = part.list_free(problem.start_state([find_effect("drive_lag")(tau=0.3)]))
+    data = EstimationData([run], HUSKY, Input.COMMAND)
+    assert data.exceeded["wheel"] == pytest.approx(4.0, rel=0.03)
+    (path,) = (one for one in data.paths if isinstance(one, WheelResiduals))
+    (number,) = path.list_free(data.start_state([find_effect("wheel_speed_limit")(limit=4.0)]))
+    assert number.bounds[0] == pytest.approx(data.exceeded["wheel"] / OVERSHOOT)
+    (lag,) = path.list_free(data.start_state([find_effect("drive_lag")(tau=0.3)]))
     assert lag.bounds[0] == 0.0
 
 
@@ -36,10 +36,10 @@ def test_four_wheels_that_turn_against_each_other_go_on_where_a_prediction_begin
     youbot, errors = vehicle_of("youbot"), []
     for effects in ({}, {name: values}):
         run = simulate(effects, vehicle=VEHICLES["youbot"], duration_s=60.0)
-        problem = Problem([run], youbot, Input.COMMAND)
-        (comparison,), state = problem.comparisons, problem.start_state()
+        data = EstimationData([run], youbot, Input.COMMAND)
+        (run_residuals,), state = data.residuals_by_run, data.start_state()
         known = [find_effect(key)(**numbers) for key, numbers in effects.items()]
-        found = comparison.find_horizon_errors(known, state.timing[0])
+        found = run_residuals.find_horizon_errors(known, state.timing[0])
         errors.append(float(np.sqrt(np.mean(found.yaw**2))))
     assert errors[1] < 1.5 * errors[0]
 
@@ -59,13 +59,13 @@ def test_after_a_gap_a_car_goes_on_with_the_measured_steering(name: str, values:
     cut = {key: table.filter(outside) for key, table in whole.items()}
     rates = []
     for tables in (whole, cut):
-        problem = Problem([load_run(align(tables, car), car, name="cut")], car, Input.COMMAND)
-        (comparison,), timing = problem.comparisons, problem.start_state().timing[0]
-        velocity = comparison.predict_velocity([find_effect(name)(**values)], timing)
-        rates.append((comparison.grid.times, velocity.w))
-    assert comparison.grid.starts.size == 2
-    after = (comparison.grid.times > end) & (comparison.grid.times < end + 20.0)
-    expected = np.interp(comparison.grid.times[after], *rates[0])
+        data = EstimationData([load_run(align(tables, car), car, name="cut")], car, Input.COMMAND)
+        (run_residuals,), timing = data.residuals_by_run, data.start_state().timing[0]
+        velocity = run_residuals.predict_velocity([find_effect(name)(**values)], timing)
+        rates.append((run_residuals.grid.times, velocity.w))
+    assert run_residuals.grid.starts.size == 2
+    after = (run_residuals.grid.times > end) & (run_residuals.grid.times < end + 20.0)
+    expected = np.interp(run_residuals.grid.times[after], *rates[0])
     error, size = rates[1][1][after] - expected, np.sqrt(np.mean(expected**2))
     assert np.abs(steering[np.searchsorted(times, end)]) > 0.1
     assert np.sqrt(np.mean(error**2)) < 0.05 * size

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
+from pipeline.estimation import EstimationData, Fitted, Input, estimate_intervals, fit_model
 from pipeline.estimation.apportion import (
     QUANTITIES,
     apportion,
@@ -20,7 +20,7 @@ from pipeline.estimation.apportion import (
     share_out,
 )
 from pipeline.estimation.estimates import estimate_unnamed
-from pipeline.estimation.ladder import Judgement, judge_model
+from pipeline.estimation.ladder import ModelAssessment, assess_model
 from pipeline.models import Model, find_effect
 from pipeline.words.errors import describe_moments
 
@@ -28,10 +28,10 @@ TRUE = {"effective_track": {"k": 1.6}, "lateral_skid": {"c": 0.08}}
 
 
 @pytest.fixture(scope="module")
-def judged() -> Judgement:
-    problem = Problem([simulate(TRUE)], vehicle_of("husky_a200"), Input.MEASURED)
-    model = Model(problem.vehicle, tuple(find_effect(name)() for name in (*TRUE, "speed_slip")))
-    return judge_model(problem, model)
+def judged() -> ModelAssessment:
+    data = EstimationData([simulate(TRUE)], vehicle_of("husky_a200"), Input.MEASURED)
+    model = Model(data.vehicle, tuple(find_effect(name)() for name in (*TRUE, "speed_slip")))
+    return assess_model(data, model)
 
 
 def shapley_by_subsets(names: tuple[str, ...], loss: dict[frozenset[str], float], name: str) -> float:
@@ -59,7 +59,7 @@ def test_shares_are_the_shapley_values_of_any_loss(count: int, seed: int) -> Non
         assert split.parts[name][0] == pytest.approx(shapley_by_subsets(names, loss, name), abs=1e-12)
 
 
-def test_a_budget_adds_up_to_the_ladders_numbers(judged: Judgement) -> None:
+def test_a_budget_adds_up_to_the_ladders_numbers(judged: ModelAssessment) -> None:
     slip, position, heading = apportion(judged, length_scale_m=0.5)
     ideal = judged.ladder.steps[0].errors
     x, y, w = ideal.velocity_rms
@@ -80,7 +80,9 @@ def test_a_budget_adds_up_to_the_ladders_numbers(judged: Judgement) -> None:
         assert left == pytest.approx(squares[budget.quantity])
 
 
-def test_what_was_put_into_a_run_carries_its_slip_and_what_was_not_carries_none(judged: Judgement) -> None:
+def test_what_was_put_into_a_run_carries_its_slip_and_what_was_not_carries_none(
+    judged: ModelAssessment,
+) -> None:
     slip = apportion(judged)[0]
     shares = {share.effect: share for share in slip.shares}
     assert [share.effect for share in slip.shares][:2] == ["effective_track", "lateral_skid"]
@@ -89,10 +91,12 @@ def test_what_was_put_into_a_run_carries_its_slip_and_what_was_not_carries_none(
     assert abs(shares["speed_slip"].share) < 0.001
 
 
-def test_the_times_with_half_of_the_error_are_found_where_it_is_above_the_noise(judged: Judgement) -> None:
+def test_the_times_with_half_of_the_error_are_found_where_it_is_above_the_noise(
+    judged: ModelAssessment,
+) -> None:
     assert find_moments(judged) == ()
     held, floor = judged.whole.held_out, judged.floor.r_mrmse_rad
-    middle = judged.problem.comparisons[0].horizons.times.mean(axis=1)
+    middle = judged.data.residuals_by_run[0].horizons.times.mean(axis=1)
     size = np.select(
         [(middle > 20.0) & (middle < 24.0), (middle > 40.0) & (middle < 42.0)], [30.0, 20.0], 1.0
     )
@@ -120,9 +124,9 @@ def test_effects_that_were_not_named_have_numbers_that_hold_the_truth() -> None:
     vehicle = vehicle_of("husky_a200")
 
     def fit(seed: int, *more: str) -> Fitted:
-        problem = Problem([simulate(TRUE, seed=seed)], vehicle, Input.MEASURED)
+        data = EstimationData([simulate(TRUE, seed=seed)], vehicle, Input.MEASURED)
         effects = tuple(find_effect(name)() for name in ("effective_track", *more))
-        return fit_model(problem, Model(vehicle, effects), exact=True)
+        return fit_model(data, Model(vehicle, effects), exact=True)
 
     rivals = [find_effect(name)() for name in ("lateral_skid", "wheel_radius", "body_speed_limit")]
     for seed in (1, 2):

@@ -9,8 +9,8 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.cli.verbs_drives import list_written_effects
-from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
-from pipeline.estimation.comparison import Comparison
+from pipeline.estimation import EstimationData, Input, estimate_intervals, fit_model
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
 from pipeline.models.effect import Excitation, KinematicEffect, Late
 from pipeline.models.expression import parse_expression
@@ -37,8 +37,8 @@ def plain_run(kind: str) -> MotionRun:
 
 
 @cache
-def comparison_of(kind: str) -> Comparison:
-    return Comparison(plain_run(kind), vehicle_of(KIND_OF[kind]), Input.COMMAND)
+def comparison_of(kind: str) -> RunResiduals:
+    return RunResiduals(plain_run(kind), vehicle_of(KIND_OF[kind]), Input.COMMAND)
 
 
 def vehicle_and_program(kind: str) -> dict[str, object]:
@@ -55,13 +55,13 @@ def test_the_catalogue_is_that_of_the_simulator() -> None:
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=ids(EFFECTS))
 def test_neutral_parameters_change_nothing_bit_for_bit(effect: type[Effect]) -> None:
-    comparison = comparison_of(effect.kinds[0])
-    base = comparison.predict_velocity((), Timing())
-    with_effect = comparison.predict_velocity((effect(),), Timing())
+    run_residuals = comparison_of(effect.kinds[0])
+    base = run_residuals.predict_velocity((), Timing())
+    with_effect = run_residuals.predict_velocity((effect(),), Timing())
     for channel in ("x", "y", "w"):
         assert np.array_equal(getattr(base, channel), getattr(with_effect, channel))
     assert np.array_equal(
-        comparison.find_residuals((), Timing()), comparison.find_residuals((effect(),), Timing())
+        run_residuals.find_residuals((), Timing()), run_residuals.find_residuals((effect(),), Timing())
     )
 
 
@@ -127,8 +127,8 @@ WRITTEN = [e for e in EFFECTS if issubclass(e, LinearEffect | KinematicEffect) a
 
 @pytest.mark.parametrize("effect", WRITTEN, ids=ids(tuple(WRITTEN)))
 def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> None:
-    comparison = comparison_of(effect.kinds[0])
-    around = comparison.context
+    run_residuals = comparison_of(effect.kinds[0])
+    around = run_residuals.context
     generator = np.random.default_rng(3)
     size = around.times.size
     wheels = Wheels(
@@ -211,9 +211,9 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     duration_s = 240.0 if effect.id in {"speed_track", "understeer", "side_slope_turn"} else 100.0
     run = simulate(hidden, duration_s=duration_s, written=WRITTEN_EFFECTS, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
-    problem = Problem([run], vehicle_of(vehicle), source)
+    data = EstimationData([run], vehicle_of(vehicle), source)
     searched = tuple(kind() for kind in EFFECTS if kind.id in names)
-    fitted = fit_model(problem, Model(problem.vehicle, searched))
+    fitted = fit_model(data, Model(data.vehicle, searched))
     estimates = estimate_intervals(fitted)
     for name, value in truth.items():
         item = estimates.find(f"{effect.id}.{name}")

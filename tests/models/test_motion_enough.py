@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
+from pipeline.estimation import EstimationData, Fitted, Input, estimate_intervals, fit_model
 from pipeline.estimation.driving_need import narrow_intervals
-from pipeline.estimation.intervals import estimate_part
+from pipeline.estimation.intervals import estimate_path
 from pipeline.models import Model, find_effect
 from pipeline.run.windows import cut_run, find_driven
 
@@ -19,7 +19,9 @@ MODEL = Model(HUSKY, tuple(find_effect(name)() for name in TRUTH))
 
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
-    return fit_model(Problem([simulate(TRUTH, duration_s=180.0)], HUSKY, Input.COMMAND), MODEL, exact=True)
+    return fit_model(
+        EstimationData([simulate(TRUTH, duration_s=180.0)], HUSKY, Input.COMMAND), MODEL, exact=True
+    )
 
 
 def test_the_last_width_is_the_stated_interval(fitted: Fitted) -> None:
@@ -36,8 +38,8 @@ def test_the_last_width_is_the_stated_interval(fitted: Fitted) -> None:
 
 
 def test_a_width_on_the_way_is_that_of_a_log_that_ended_there(fitted: Fitted) -> None:
-    run = fitted.problem.runs[0]
-    short = Problem([cut_run(run, end_s=find_driven(run, 90.0))], HUSKY, Input.COMMAND)
+    run = fitted.data.runs[0]
+    short = EstimationData([cut_run(run, end_s=find_driven(run, 90.0))], HUSKY, Input.COMMAND)
     ended = narrow_intervals(fit_model(short, MODEL, exact=True))
     ratios = []
     for label, curve in narrow_intervals(fitted).items():
@@ -53,7 +55,7 @@ def test_a_number_that_the_run_leaves_open_takes_no_other_along(fitted: Fitted) 
     opened = replace(
         fit, free=(*fit.free, *fit.free), columns=np.concatenate((fit.columns, 1e-8 * faint), axis=2)
     )
-    (lag,) = estimate_part(fit).items
-    beside, left_open = estimate_part(opened).items
+    (lag,) = estimate_path(fit).items
+    beside, left_open = estimate_path(opened).items
     assert np.isnan(left_open.low)
     assert beside.half == pytest.approx(lag.half, rel=0.01)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.estimation import Input
-from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, format_model, list_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
@@ -193,7 +193,7 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
             continue
         assert run.commands is not None
         model = Model(vehicle_of(PRESETS[vehicle]))
-        comparison = Comparison(run, model.vehicle, Input.COMMAND, rate_hz=200.0)
+        run_residuals = RunResiduals(run, model.vehicle, Input.COMMAND, rate_hz=200.0)
         series = run.commands
         columns = [series.times, series.left, series.right]
         columns += [series.steering if series.sideways is None else series.sideways]
@@ -212,14 +212,14 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
                 # Bounds that act: what acts beside them alone moves nothing otherwise.
                 moved += beside(tau=0.2, reset=0.3, drag=0.05, bound=0.3, no_load=1.2, scrub=0.6, creep=0.07)
             moved += effect
-            expected = comparison.predict_velocity(moved.effects, Timing())
+            expected = run_residuals.predict_velocity(moved.effects, Timing())
             fine = run_exported(
                 export_model(ModelFile(moved), "python"), rows, run.duration_s, step_s=STEP_S / 5
             )
             # The model's cells hold means; so do these.
             got = fine[: len(fine) // 5 * 5].reshape(-1, 5, 7).mean(axis=1)
             # Where a command changes within a cell, a limit acts here on both and in the model on their mean.
-            times = comparison.grid.times
+            times = run_residuals.grid.times
             kept = times < run.duration_s - 0.1
             kept &= np.abs(times[:, None] - series.times).min(axis=1) > STEP_S / 2
             times = times[kept]

@@ -9,7 +9,7 @@ from motion_runs import simulate, vehicle_of
 from verbs import run_slip
 
 from pipeline.cli import main
-from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model, score
+from pipeline.estimation import EstimationData, Fitted, Input, estimate_intervals, fit_model, score
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.models import Model, find_effect, read_model
 from pipeline.run import MotionError, MotionRun
@@ -28,12 +28,12 @@ def run() -> MotionRun:
     return simulate(TRUTH, seed=4, duration_s=90.0)
 
 
-def problem_of(run: MotionRun) -> Problem:
-    return Problem([run], HUSKY, Input.MEASURED)
+def problem_of(run: MotionRun) -> EstimationData:
+    return EstimationData([run], HUSKY, Input.MEASURED)
 
 
-def fit_with_prior(problem: Problem, model: Model, numbers: dict[str, tuple[float, float]]) -> Fitted:
-    return fit_model(tie_to_prior(problem, numbers), model, exact=True)
+def fit_with_prior(data: EstimationData, model: Model, numbers: dict[str, tuple[float, float]]) -> Fitted:
+    return fit_model(tie_to_prior(data, numbers), model, exact=True)
 
 
 def test_a_run_is_cut_by_how_long_it_was_driven(run: MotionRun) -> None:
@@ -61,10 +61,10 @@ def test_what_is_known_counts_while_little_was_driven_and_the_run_afterwards(run
 
 
 def test_a_sure_prior_holds_and_a_vague_one_changes_nothing(run: MotionRun) -> None:
-    problem = problem_of(cut_run(run, end_s=find_driven(run, 20.0)))
-    alone = fit_model(problem, MODEL, exact=True)
-    held = fit_with_prior(problem, MODEL, {label: (mean, 1e-6) for label, (mean, _) in KNOWN.items()})
-    free = fit_with_prior(problem, MODEL, {label: (mean, 1e4) for label, (mean, _) in KNOWN.items()})
+    data = problem_of(cut_run(run, end_s=find_driven(run, 20.0)))
+    alone = fit_model(data, MODEL, exact=True)
+    held = fit_with_prior(data, MODEL, {label: (mean, 1e-6) for label, (mean, _) in KNOWN.items()})
+    free = fit_with_prior(data, MODEL, {label: (mean, 1e4) for label, (mean, _) in KNOWN.items()})
     for effect in MODEL:
         for name, value in effect.values.items():
             assert held.model.effect(effect.id).values[name] == pytest.approx(value, abs=1e-4)
@@ -73,8 +73,8 @@ def test_a_sure_prior_holds_and_a_vague_one_changes_nothing(run: MotionRun) -> N
 
 
 def test_the_posterior_is_narrower_than_the_prior_and_holds_the_truth(run: MotionRun) -> None:
-    problem = tie_to_prior(problem_of(cut_run(run, end_s=find_driven(run, 8.0))), KNOWN)
-    fitted = fit_model(problem, MODEL, exact=True)
+    data = tie_to_prior(problem_of(cut_run(run, end_s=find_driven(run, 8.0))), KNOWN)
+    fitted = fit_model(data, MODEL, exact=True)
     estimates = estimate_intervals(fitted)
     for label, truth in (("effective_track.k", 1.8), ("lateral_skid.c", 0.08)):
         item = estimates.find(label)

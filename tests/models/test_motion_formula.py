@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation import EstimationData, Input, fit_model
 from pipeline.models import Model
 from pipeline.models.expression import parse_expression
 from pipeline.models.formula import FormulaEffect, make_parameter
@@ -103,18 +103,18 @@ def test_a_formula_finds_physics_that_no_catalogue_has() -> None:
 
     run = simulate({}, extra=blow, duration_s=120.0)
     wind = FormulaEffect("crosswind", {"v_y": "k * sin(yaw)"}, (make_parameter("k", "m/s", (-1.0, 1.0)),))
-    problem = Problem([run], vehicle_of("husky_a200"), Input.MEASURED)
-    fitted = fit_model(problem, Model(problem.vehicle, (wind,)))
+    data = EstimationData([run], vehicle_of("husky_a200"), Input.MEASURED)
+    fitted = fit_model(data, Model(data.vehicle, (wind,)))
     assert fitted.model.effect("crosswind").values["k"] == pytest.approx(0.08, abs=0.005)
 
 
 def test_rates_of_signals_can_be_used_and_are_nothing_across_holes() -> None:
     run = simulate({}, duration_s=60.0)
     effect = FormulaEffect("jerk", {"v_x": "k * v0_rate"}, (make_parameter("k", "s", (-1.0, 1.0)),), k=0.1)
-    problem = Problem([run], vehicle_of("husky_a200"), Input.MEASURED)
-    model = Model(problem.vehicle, (effect,))
-    ideal = problem.find_residuals(problem.start_state())
-    shaken = problem.find_residuals(problem.start_state(model))
+    data = EstimationData([run], vehicle_of("husky_a200"), Input.MEASURED)
+    model = Model(data.vehicle, (effect,))
+    ideal = data.find_residuals(data.start_state())
+    shaken = data.find_residuals(data.start_state(model))
     assert np.isfinite(shaken).all()
     assert np.abs(shaken - ideal)[:, 0].max() > 0.01
     assert np.array_equal(shaken[:, 2], ideal[:, 2])
@@ -129,7 +129,7 @@ def test_a_wheel_out_of_round_is_a_formula_of_what_it_has_turned() -> None:
     run = simulate({}, extra=wobble, duration_s=60.0)
     text = "left * (a * sin(left_angle) + b * cos(left_angle))"
     parameters = tuple(make_parameter(name, "m", (-0.1, 0.1)) for name in "ab")
-    problem = Problem([run], husky, Input.MEASURED)
-    fitted = fit_model(problem, Model(husky, (FormulaEffect("oval", {"v_x": text}, parameters),)))
+    data = EstimationData([run], husky, Input.MEASURED)
+    fitted = fit_model(data, Model(husky, (FormulaEffect("oval", {"v_x": text}, parameters),)))
     size = math.hypot(*fitted.model.effect("oval").values.values())
     assert size == pytest.approx(0.05 * husky.wheel_radius_m, rel=0.1)

@@ -13,7 +13,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import find_runs
-from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
+from pipeline.estimation import EstimationData, Input, estimate_intervals, fit_model
 from pipeline.models import Model, find_effect
 from pipeline.run import load_run
 from pipeline.simulate import (
@@ -195,8 +195,8 @@ def test_two_long_circles_are_no_incident() -> None:
 
 def fit(scenario: Scenario) -> dict[str, tuple[float, float, float]]:
     run = as_run(simulate_run(scenario))
-    problem = Problem([run], HUSKY, Input.COMMAND)
-    fitted = fit_model(problem, Model(HUSKY, tuple(find_effect(name)() for name in TRUTH)), exact=True)
+    data = EstimationData([run], HUSKY, Input.COMMAND)
+    fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in TRUTH)), exact=True)
     items = estimate_intervals(fitted).items
     return {item.free.label: (item.value, item.low, item.high) for item in items if item.free.effect}
 
@@ -215,7 +215,7 @@ def test_an_incident_does_not_move_what_is_fitted(kind: IncidentKind) -> None:
 def test_the_fit_goes_on_without_the_seconds_of_an_incident() -> None:
     made = simulate_run(make_scenario(TRUTH, incidents=(Incident("emergency_stop", 40.0, 60.0),)))
     run = load_run(tables_of(made, HUSKY), HUSKY, name="stopped")
-    middles = Problem([run], HUSKY, Input.COMMAND).whole.times.mean(axis=1)
+    middles = EstimationData([run], HUSKY, Input.COMMAND).whole.times.mean(axis=1)
     assert not ((middles > 41.0) & (middles < 60.0)).any()
     assert (middles < 40.0).sum() > 50
     assert (middles > 65.0).sum() > 50

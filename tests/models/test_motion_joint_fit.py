@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem
-from pipeline.estimation.fit import fit_part
-from pipeline.estimation.parts import weigh_runs
+from pipeline.estimation import EstimationData, Input
+from pipeline.estimation.fit import fit_path
+from pipeline.estimation.path_residuals import weigh_runs
 from pipeline.models import find_effect
 from pipeline.plan.next_drive import read_values
 from pipeline.simulate import VEHICLES, Program
@@ -19,7 +19,7 @@ HIDDEN = {
 }  # fmt: skip
 
 
-def make_problem() -> Problem:
+def make_problem() -> EstimationData:
     """A gentle run, which never needs all force, and a fast one that hides nothing of it."""
     programs = (Program("smooth", speed_scale=0.2, turn_scale=0.25), Program("smooth"))
     runs = [
@@ -28,13 +28,13 @@ def make_problem() -> Problem:
         )
         for seed, program in enumerate(programs)
     ]
-    return Problem(runs, WARTHOG, Input.COMMAND)
+    return EstimationData(runs, WARTHOG, Input.COMMAND)
 
 
 @pytest.mark.long
 def test_a_servo_comes_back_from_a_gentle_and_a_fast_run() -> None:
-    problem = make_problem()
-    drive = problem.parts[1]
+    data = make_problem()
+    drive = data.paths[1]
     start = {
         "tau": 0.25,
         "reset": 0.2,
@@ -45,10 +45,10 @@ def test_a_servo_comes_back_from_a_gentle_and_a_fast_run() -> None:
         "creep": 0.1,
     }
     begun = find_effect("wheel_servo")(**start)
-    fit = fit_part(drive, problem.start_state([begun]))
+    fit = fit_path(drive, data.start_state([begun]))
     (found,) = fit.state.effects
     # As likely as from the truth within two steps that are not worth taking.
-    true = fit_part(drive, problem.start_state([find_effect("wheel_servo")(**HIDDEN)]))
+    true = fit_path(drive, data.start_state([find_effect("wheel_servo")(**HIDDEN)]))
     assert fit.score <= true.score + 0.1
     for name in ("tau", "reset", "scrub", "bound", "no_load"):
         assert found.values[name] == pytest.approx(HIDDEN[name], rel=0.2), name
@@ -59,15 +59,15 @@ def test_a_run_that_counts_less_leaves_the_number_to_the_others() -> None:
         simulate({"drive_lag": tau}, duration_s=60.0, vehicle=VEHICLES["warthog"], program=Program("smooth"))
         for tau in (0.3, 0.6)
     ]
-    drive = Problem(runs, WARTHOG, Input.COMMAND).parts[1]
-    start = Problem(runs, WARTHOG, Input.COMMAND).start_state([find_effect("drive_lag")(tau=0.45)])
+    drive = EstimationData(runs, WARTHOG, Input.COMMAND).paths[1]
+    start = EstimationData(runs, WARTHOG, Input.COMMAND).start_state([find_effect("drive_lag")(tau=0.45)])
 
     def fit(*shares: float) -> float:
-        found = fit_part(weigh_runs(drive, np.array(shares)), start)
+        found = fit_path(weigh_runs(drive, np.array(shares)), start)
         assert np.isfinite(found.noise.scale[1, 2]).all()
         return found.state.effects[0].values["tau"]
 
-    assert fit(1.0, 1.0) == fit_part(drive, start).state.effects[0].values["tau"]
+    assert fit(1.0, 1.0) == fit_path(drive, start).state.effects[0].values["tau"]
     assert fit(1.0, 0.1) == pytest.approx(0.3, abs=0.03)
     assert fit(0.1, 1.0) == pytest.approx(0.6, abs=0.03)
 
@@ -81,9 +81,9 @@ def test_a_gentle_run_counts_as_much_as_a_fast_one() -> None:
         )
         for scale in (0.2, 1.0)
     ]  # fmt: skip
-    drive = Problem(runs, WARTHOG, Input.COMMAND).parts[1]
-    state = Problem(runs, WARTHOG, Input.COMMAND).start_state([find_effect("drive_lag")(tau=0.3)])
-    white = fit_part(drive, state).white
+    drive = EstimationData(runs, WARTHOG, Input.COMMAND).paths[1]
+    state = EstimationData(runs, WARTHOG, Input.COMMAND).start_state([find_effect("drive_lag")(tau=0.3)])
+    white = fit_path(drive, state).white
     gentle, fast = (float((white.columns[drive.run[white.rows] == run] ** 2).sum()) for run in range(2))
     # Weighed alike they would say of it as the squares of their speeds, 1 to 25.
     assert gentle > 0.3 * fast
@@ -102,13 +102,13 @@ def test_a_number_of_the_ground_is_one_on_each_ground_and_the_vehicles_is_one_on
         for seed, terrain in enumerate(("gravel", "gravel", "ice"))
         for k, tau in [grounds[terrain]]
     ]  # fmt: skip
-    problem = Problem(runs, WARTHOG, Input.COMMAND)
-    body, drive = problem.parts
-    track = fit_part(body, problem.start_state([find_effect("effective_track")(k=1.8)]))
+    data = EstimationData(runs, WARTHOG, Input.COMMAND)
+    body, drive = data.paths
+    track = fit_path(body, data.start_state([find_effect("effective_track")(k=1.8)]))
     found = [dict(track.state.own[run])["effective_track", "k"] for run in range(3)]
     assert found[0] == found[1]
     assert found == pytest.approx([1.6, 1.6, 2.4], rel=0.01)
-    lag = fit_part(drive, problem.start_state([find_effect("turn_lag")(tau_diff=0.5)]))
+    lag = fit_path(drive, data.start_state([find_effect("turn_lag")(tau_diff=0.5)]))
     assert not lag.state.own
     assert lag.state.effects[0].values["tau_diff"] == pytest.approx(0.3, abs=0.02)
 
@@ -123,9 +123,9 @@ def test_a_terrain_that_was_never_driven_is_expected_to_be_like_most_of_the_othe
         )
         for seed, (terrain, k) in enumerate(tracks.items())
     ]
-    problem = Problem(runs, WARTHOG, Input.MEASURED)
-    (body,) = problem.parts
-    fit = fit_part(body, problem.start_state([find_effect("effective_track")(k=1.8)]))
-    expected = {terrain: read_values(problem, [fit], terrain) for terrain in ("mud", "ice")}
+    data = EstimationData(runs, WARTHOG, Input.MEASURED)
+    (body,) = data.paths
+    fit = fit_path(body, data.start_state([find_effect("effective_track")(k=1.8)]))
+    expected = {terrain: read_values(data, [fit], terrain) for terrain in ("mud", "ice")}
     assert expected["mud"]["effective_track.k"] == pytest.approx(1.715, rel=0.01)
     assert expected["ice"]["effective_track.k"] == pytest.approx(2.4, rel=0.01)

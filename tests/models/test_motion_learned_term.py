@@ -11,10 +11,10 @@ import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-from pipeline.estimation import Comparison, Fitted, HeldOut, Input, Problem, fit_model, hold_out
+from pipeline.estimation import EstimationData, Fitted, HeldOut, Input, RunResiduals, fit_model, hold_out
 from pipeline.estimation.across_runs import Ratios, make_bands, measure_coverage
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.ladder import judge_model
+from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.learned_step import (
     ResidualData,
     learn_beyond,
@@ -37,23 +37,23 @@ TRACK = {"effective_track": {"k": 1.8}}
 SLOWED = {**TRACK, "turning_resistance": {"k": 0.25}}
 
 
-def make_problem(truth: object, **more: object) -> Problem:
-    return Problem([simulate(truth, duration_s=240.0, **more)], HUSKY, Input.MEASURED)  # type: ignore[arg-type]
+def make_problem(truth: object, **more: object) -> EstimationData:
+    return EstimationData([simulate(truth, duration_s=240.0, **more)], HUSKY, Input.MEASURED)  # type: ignore[arg-type]
 
 
-def fit_track(problem: Problem) -> tuple[Fitted, HeldOut]:
-    fitted = fit_model(problem, Model(HUSKY, (find_effect("effective_track")(),)), exact=True)
-    return fitted, hold_out(problem, fitted)
+def fit_track(data: EstimationData) -> tuple[Fitted, HeldOut]:
+    fitted = fit_model(data, Model(HUSKY, (find_effect("effective_track")(),)), exact=True)
+    return fitted, hold_out(data, fitted)
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
+def data() -> EstimationData:
     """A run of which the model lacks that turning slows the vehicle."""
     return make_problem(SLOWED)
 
 
 @pytest.fixture(scope="module")
-def complete() -> Problem:
+def complete() -> EstimationData:
     """A run that lacks nothing."""
     return make_problem(TRACK)
 
@@ -65,13 +65,13 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
-def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(problem: Problem) -> None:
-    fitted, below = fit_track(problem)
-    rung = make_learned_step(problem, fitted, below)
+def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(data: EstimationData) -> None:
+    fitted, below = fit_track(data)
+    rung = make_learned_step(data, fitted, below)
     assert rung.refusal == ""
     assert rung.held_out.pooled.t_mrmse_m < 0.7 * below.pooled.t_mrmse_m
-    ideal = hold_out(problem, fit_model(problem, Model(HUSKY), exact=True)).pooled
-    shares = rung.share_removed(ideal, estimate_floor(problem))
+    ideal = hold_out(data, fit_model(data, Model(HUSKY), exact=True)).pooled
+    shares = rung.share_removed(ideal, estimate_floor(data))
     for share in shares.values():
         assert share is not None
         assert share[0] < share[1] + 0.02
@@ -82,14 +82,14 @@ def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(problem
     assert rung.term.bands.of == "of this run only"
 
 
-def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Problem) -> None:
+def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: EstimationData) -> None:
     fitted, below = fit_track(complete)
     rung = make_learned_step(complete, fitted, below)
     assert rung.refusal
     kept = hold_out(complete, fitted, learn_where_it_helps(complete)).pooled
     assert kept.t_mrmse_m <= 1.02 * below.pooled.t_mrmse_m
     assert kept.r_mrmse_rad <= 1.02 * below.pooled.r_mrmse_rad
-    judged = judge_model(complete, fitted.model)
+    judged = assess_model(complete, fitted.model)
     step = learn_beyond(judged)
     assert step is not None
     told = summarize_learned(step, judged.ideal.errors, judged.floor)
@@ -98,8 +98,10 @@ def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Pro
     assert told.term is None
 
 
-def test_a_fold_is_learned_without_its_stretches(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    fitted, _ = fit_track(problem)
+def test_a_fold_is_learned_without_its_stretches(
+    data: EstimationData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted, _ = fit_track(data)
     seen: list[np.ndarray] = []
     learn = ResidualData.learn
 
@@ -108,12 +110,12 @@ def test_a_fold_is_learned_without_its_stretches(problem: Problem, monkeypatch: 
         return learn(data, rows)
 
     monkeypatch.setattr(ResidualData, "learn", watch)
-    hold_out(problem, fitted, learn_fold(problem))
-    for rows, fold in zip(seen, problem.folds, strict=True):
+    hold_out(data, fitted, learn_fold(data))
+    for rows, fold in zip(seen, data.folds, strict=True):
         assert not (rows & fold.test).any()
     seen.clear()
-    first = problem.folds[0]
-    ResidualData(problem, fitted.state).cross_validate(first.train)
+    first = data.folds[0]
+    ResidualData(data, fitted.state).cross_validate(first.train)
     assert seen
     for rows in seen:
         assert not (rows & ~first.train).any()
@@ -166,24 +168,24 @@ def test_a_model_file_holds_it_and_gives_it_back() -> None:
     )
 
 
-def test_the_exported_function_adds_what_the_model_adds(problem: Problem) -> None:
-    fitted, _ = fit_track(problem)
-    term = ResidualData(problem, fitted.state).learn(np.ones(problem.whole.run.size, dtype=bool))
+def test_the_exported_function_adds_what_the_model_adds(data: EstimationData) -> None:
+    fitted, _ = fit_track(data)
+    term = ResidualData(data, fitted.state).learn(np.ones(data.whole.run.size, dtype=bool))
     # It stands at the start, on even ground.
     known = [one for one in term.inputs if not one.name.startswith(("missed", "roll", "pitch"))]
     assert len(known) > 10
     models = fitted.model, fitted.model + ResidualTerm(known)
-    series = problem.runs[0].commands
+    series = data.runs[0].commands
     assert series is not None
     rows = list(zip(series.times.tolist(), series.left.tolist(), series.right.tolist(), strict=True))
-    step_s, comparison = 0.005, Comparison(problem.runs[0], HUSKY, Input.COMMAND, rate_hz=200.0)
+    step_s, run_residuals = 0.005, RunResiduals(data.runs[0], HUSKY, Input.COMMAND, rate_hz=200.0)
     driven, wanted = [], []
     for model in models:
         space: dict[str, object] = {}
         exec(compile(export_model(ModelFile(model), "python"), "exported", "exec"), space)  # noqa: S102 - made here
         driven.append(np.array(space["predict"](rows, 15.0, step_s=step_s)))  # type: ignore[operator]
-        wanted.append(comparison.predict_velocity(model.effects, Timing()))
-    times = comparison.grid.times
+        wanted.append(run_residuals.predict_velocity(model.effects, Timing()))
+    times = run_residuals.grid.times
     # Where a command changes within a cell, the model acts on its mean.
     kept = (times > 1.0) & (times < 14.0)
     kept[kept] &= np.abs(times[kept][:, None] - series.times).min(axis=1) > step_s
@@ -226,7 +228,7 @@ def grounds() -> list[MotionRun]:
 
 @pytest.mark.long
 def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(grounds: list[MotionRun]) -> None:
-    alike, unlike = (Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:]))
+    alike, unlike = (EstimationData(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:]))
     assert make_learned_step(alike, *fit_track(alike)).refusal == ""
     refusal = make_learned_step(unlike, *fit_track(unlike)).refusal
     assert "learned without ice, on seed 3 position error rises by" in refusal

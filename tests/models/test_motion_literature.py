@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from verbs import run_verb
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation import EstimationData, Input, fit_model
 from pipeline.models import Model, Timing, read_model
 from pipeline.models.literature import MODELS, find_model
 from pipeline.simulate import VEHICLES, Program
@@ -20,19 +20,19 @@ TRACK_M = HUSKY.track_width_m or math.nan
 
 
 @pytest.fixture(scope="module")
-def driven() -> Problem:
-    return Problem([simulate({}, duration_s=40.0)], HUSKY, Input.MEASURED)
+def driven() -> EstimationData:
+    return EstimationData([simulate({}, duration_s=40.0)], HUSKY, Input.MEASURED)
 
 
-def predict(problem: Problem, model: Model) -> Floats:
+def predict(data: EstimationData, model: Model) -> Floats:
     """Velocities of a model on the cells of the run, shape (3, n)."""
-    velocity = problem.comparisons[0].predict_velocity(model.effects, Timing())
+    velocity = data.residuals_by_run[0].predict_velocity(model.effects, Timing())
     return np.array((velocity.x, velocity.y, velocity.w))
 
 
-def split_sides(problem: Problem) -> tuple[Floats, Floats]:
+def split_sides(data: EstimationData) -> tuple[Floats, Floats]:
     """Speeds of the left and of the right wheels' rims [m/s]."""
-    forward, _, turning = predict(problem, Model(HUSKY))
+    forward, _, turning = predict(data, Model(HUSKY))
     return forward - 0.5 * TRACK_M * turning, forward + 0.5 * TRACK_M * turning
 
 
@@ -63,7 +63,7 @@ def test_a_model_file_of_each_is_written_and_read_back(model: object, tmp_path: 
     assert read_model(path).model == found.make(vehicle_of(vehicle))
 
 
-def test_the_extended_differential_drive_is_an_effective_track(driven: Problem) -> None:
+def test_the_extended_differential_drive_is_an_effective_track(driven: EstimationData) -> None:
     model = find_model("extended_differential_drive").make(HUSKY)
     assert model.ids == ("effective_track",)
     forward, _, turning = predict(driven, Model(HUSKY))
@@ -74,7 +74,7 @@ def test_the_extended_differential_drive_is_an_effective_track(driven: Problem) 
 
 
 @pytest.mark.parametrize("name", ["icr_symmetric", "icr_asymmetric"])
-def test_the_icr_models_are_their_effects_to_rounding(driven: Problem, name: str) -> None:
+def test_the_icr_models_are_their_effects_to_rounding(driven: EstimationData, name: str) -> None:
     """Mandow et al.: v = 1/(y_l - y_r) [[-a_l y_r, a_r y_l], [a_l x, -a_r x], [-a_l, a_r]] (v_l, v_r)."""
     symmetric = name == "icr_symmetric"
     uneven, radius, wide, aside, ahead = (
@@ -93,7 +93,7 @@ def test_the_icr_models_are_their_effects_to_rounding(driven: Problem, name: str
     np.testing.assert_allclose(found, map_of_mandow @ np.array((left, right)), atol=1e-12)
 
 
-def test_the_full_linear_model_reaches_any_map_near_the_ideal_one(driven: Problem) -> None:
+def test_the_full_linear_model_reaches_any_map_near_the_ideal_one(driven: EstimationData) -> None:
     left, right = split_sides(driven)
     wanted = np.array([[0.45, 0.52], [0.03, -0.08], [-1.1, 1.05]])
     asked = wanted @ np.array((left, right))
@@ -111,11 +111,11 @@ def test_the_full_linear_model_reaches_any_map_near_the_ideal_one(driven: Proble
     assert np.abs(least_squares(miss, start, x_scale=0.1).fun).max() < 1e-8
 
 
-def test_seegmiller_on_flat_ground_is_linear_in_speed_and_centripetal_force(driven: Problem) -> None:
+def test_seegmiller_on_flat_ground_is_linear_in_speed_and_centripetal_force(driven: EstimationData) -> None:
     forward, _, turning = predict(driven, Model(HUSKY))
     named = {"c1": 3.0, "c2": -0.1, "c3": 2.0, "c4": 0.5, "c5": 0.02, "c6": -0.3}
     labels = {f"seegmiller_terms__{name}": value for name, value in named.items()}
-    flat = np.abs(driven.comparisons[0].context.attitude[:, :2]).max(axis=1) < 0.01
+    flat = np.abs(driven.residuals_by_run[0].context.attitude[:, :2]).max(axis=1) < 0.01
     assert flat.mean() > 0.9
     found = predict(driven, change(find_model("seegmiller").make(HUSKY), **labels))
     pull = -forward * turning / 9.80665
@@ -178,8 +178,8 @@ def test_a_fit_to_a_log_of_known_truth_returns_it(
     physics: Callable[[SimulatedState], tuple[float, float, float]],
     truth: dict[str, tuple[float, float]],
 ) -> None:
-    problem = Problem([simulate({}, extra=physics, duration_s=120.0)], HUSKY, Input.MEASURED)
-    fitted = fit_model(problem, find_model(name).make(HUSKY), exact=True)
+    data = EstimationData([simulate({}, extra=physics, duration_s=120.0)], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, find_model(name).make(HUSKY), exact=True)
     values = fitted.model.effect(f"{name}_terms").values
     for number, (value, margin) in truth.items():
         assert values[number] == pytest.approx(value, abs=margin), number
@@ -187,8 +187,8 @@ def test_a_fit_to_a_log_of_known_truth_returns_it(
 
 def test_a_fit_of_the_icr_model_returns_known_centres_of_rotation() -> None:
     truth = {"effective_track": {"k": 1.8}, "icr_offset": {"x_icr": 0.12}, "wheel_asymmetry": {"e": 0.04}}
-    problem = Problem([simulate(truth, duration_s=120.0)], HUSKY, Input.MEASURED)
-    fitted = fit_model(problem, find_model("icr_asymmetric").make(HUSKY), exact=True).model
+    data = EstimationData([simulate(truth, duration_s=120.0)], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, find_model("icr_asymmetric").make(HUSKY), exact=True).model
     assert fitted.effect("effective_track").values["k"] == pytest.approx(1.8, rel=0.02)
     assert fitted.effect("icr_offset").values["x_icr"] == pytest.approx(0.12, abs=0.01)
     assert fitted.effect("wheel_asymmetry").values["e"] == pytest.approx(0.04, abs=0.01)
@@ -206,7 +206,9 @@ def test_a_fit_of_the_icr_model_returns_known_centres_of_rotation() -> None:
 def test_a_fit_of_a_car_s_model_returns_the_truth(name: str, truth: dict[str, dict[str, float]]) -> None:
     run = simulate(truth, duration_s=120.0, vehicle=VEHICLES["car"], program=Program(speed_scale=0.5))
     car = vehicle_of(VEHICLES["car"].name)
-    fitted = fit_model(Problem([run], car, Input.COMMAND), find_model(name).make(car), exact=True).model
+    fitted = fit_model(
+        EstimationData([run], car, Input.COMMAND), find_model(name).make(car), exact=True
+    ).model
     for effect, numbers in truth.items():
         for number, value in numbers.items():
             assert fitted.effect(effect).values[number] == pytest.approx(value, rel=0.1), effect

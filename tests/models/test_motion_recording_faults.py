@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from motion_runs import QUIET, make_scenario, tables_of, vehicle_of
 
-from pipeline.estimation import Input, Problem, fit_model, hold_out
+from pipeline.estimation import EstimationData, Input, fit_model, hold_out
 from pipeline.estimation.floor import estimate_floor
 from pipeline.models import Model
 from pipeline.run import load_run
@@ -58,6 +58,6 @@ def test_what_a_localization_corrects_every_few_seconds_is_noise(seed: int) -> N
     poses = tables["poses"].with_columns(
         *(pl.col(axis) + error[axis] for axis in "xy"), corrected=pl.Series(corrected)
     )
-    problem = Problem([load_run({**tables, "poses": poses}, HUSKY, name="waits")], HUSKY, Input.COMMAND)
-    unseen = hold_out(problem, fit_model(problem, Model(HUSKY, ()))).pooled
-    assert 0.7 < estimate_floor(problem).t_mrmse_m / unseen.t_mrmse_m < 1.4
+    data = EstimationData([load_run({**tables, "poses": poses}, HUSKY, name="waits")], HUSKY, Input.COMMAND)
+    unseen = hold_out(data, fit_model(data, Model(HUSKY, ()))).pooled
+    assert 0.7 < estimate_floor(data).t_mrmse_m / unseen.t_mrmse_m < 1.4

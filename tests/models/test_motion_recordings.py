@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from real_recordings import CASES, INERTIA, TRACK, C, Case, M, Recordings, make_model, measure
 
-from pipeline.estimation import Problem, carry_over, climb, fit_model
+from pipeline.estimation import EstimationData, carry_over, climb, fit_model
 from pipeline.estimation.ladder import compare_losses
 from pipeline.models import Model, find_effect
 from pipeline.results.reading import CHANCE, list_rises
@@ -82,7 +82,7 @@ def test_the_right_effects_reach_the_table(case: Case, recordings: Recordings) -
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.log}-{case.source.value}")
 def test_no_step_raises_both_errors_together(case: Case, recordings: Recordings) -> None:
     run, vehicle = recordings.load(case.log)
-    ladder = climb(Problem([run], vehicle, case.source), make_model(vehicle, case.effects))
+    ladder = climb(EstimationData([run], vehicle, case.source), make_model(vehicle, case.effects))
     ideal = ladder.steps[0].errors
     for before, after in pairwise(ladder.steps):
         below, reached = (sum(step.errors.ratios(ideal)[3:]) for step in (before, after))
@@ -101,8 +101,8 @@ def test_a_model_of_one_asphalt_predicts_another_but_not_ice(recordings: Recordi
         recordings.load(name)[0]
         for name in ("warthog_wheels_asphalt", "warthog_wheels_ice_2024_7_30_16h30s21")
     ]
-    problem = Problem([run], vehicle, M)
-    fitted = fit_model(problem, Model(vehicle, (find_effect(TRACK)(), find_effect(INERTIA)())))
+    data = EstimationData([run], vehicle, M)
+    fitted = fit_model(data, Model(vehicle, (find_effect(TRACK)(), find_effect(INERTIA)())))
     asphalt, ice = carry_over(fitted.model, others, M, fitted_on=["asphalt"])
     assert asphalt.ratio <= 1.1
     assert asphalt.warning == ""

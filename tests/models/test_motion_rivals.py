@@ -6,7 +6,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-from pipeline.estimation import Errors, HeldOut, Input, Problem, fit_model, hold_out
+from pipeline.estimation import Errors, EstimationData, HeldOut, Input, fit_model, hold_out
 from pipeline.estimation.rivals import (
     Contest,
     Lesson,
@@ -27,8 +27,8 @@ LEARNERS = ("learned_linear", "learned_process", "learned_trees")
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
-    return Problem([simulate(TRUTH, duration_s=120.0)], HUSKY, Input.MEASURED)
+def data() -> EstimationData:
+    return EstimationData([simulate(TRUTH, duration_s=120.0)], HUSKY, Input.MEASURED)
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +44,10 @@ def make_rival(name: str, errors: np.ndarray) -> Rival:
     return Rival(name, 1, HeldOut(np.zeros((1, 3)), (errors,), (errors,), pooled, (pooled,)), 0.0)
 
 
-def test_errors_are_those_of_the_ladder(problem: Problem) -> None:
+def test_errors_are_those_of_the_ladder(data: EstimationData) -> None:
     model = find_model("extended_differential_drive").make(HUSKY)
-    rival = judge_rival(problem, "track", model)
-    laddered = hold_out(problem, fit_model(problem, model, exact=True)).pooled
+    rival = judge_rival(data, "track", model)
+    laddered = hold_out(data, fit_model(data, model, exact=True)).pooled
     assert rival.held_out.pooled == laddered
     assert rival.numbers == 1
     assert rival.read("t_mrmse_m") == laddered.t_mrmse_m
@@ -93,10 +93,10 @@ def test_what_chance_put_behind_the_best_is_marked_and_no_more() -> None:
     assert [contest.is_best(rival, "t_mrmse_m") for rival in rivals] == [False, True, True]
 
 
-def test_the_right_model_wins_and_those_that_hold_it_are_not_told_apart(problem: Problem) -> None:
+def test_the_right_model_wins_and_those_that_hold_it_are_not_told_apart(data: EstimationData) -> None:
     names = ("ideal", "extended_differential_drive", "icr_asymmetric", "full_linear")
-    rivals = [judge_rival(problem, name, find_model(name).make(HUSKY)) for name in names]
-    contest = hold_contest(problem, rivals)
+    rivals = [judge_rival(data, name, find_model(name).make(HUSKY)) for name in names]
+    contest = hold_contest(data, rivals)
     right = rivals[1]
     for metric in ("t_mrmse_m", "r_mrmse_rad"):
         assert contest.is_best(right, metric)
@@ -107,29 +107,29 @@ def test_the_right_model_wins_and_those_that_hold_it_are_not_told_apart(problem:
 @pytest.mark.long
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learned_rival_sees_most_of_what_a_model_lacks_on_data_not_seen(
-    problem: Problem, name: str
+    data: EstimationData, name: str
 ) -> None:
     learner = next(one for one in list_learners() if one.name == name)
-    ideal = judge_rival(problem, "ideal", Model(HUSKY))
-    learned = judge_learned(problem, fit_model(problem, Model(HUSKY), exact=True), learner)
+    ideal = judge_rival(data, "ideal", Model(HUSKY))
+    learned = judge_learned(data, fit_model(data, Model(HUSKY), exact=True), learner)
     assert learned.numbers is None
     assert learned.read("r_mrmse_rad") < 0.3 * ideal.read("r_mrmse_rad")
     assert learned.read("t_mrmse_m") < 0.6 * ideal.read("t_mrmse_m")
 
 
-def test_a_fold_is_learned_without_its_stretches(problem: Problem) -> None:
+def test_a_fold_is_learned_without_its_stretches(data: EstimationData) -> None:
     """A learner that knows windows by heart is no better on those that it has not seen."""
-    fitted = fit_model(problem, Model(HUSKY), exact=True)
-    lesson = Lesson(problem, list_learners()[0])
+    fitted = fit_model(data, Model(HUSKY), exact=True)
+    lesson = Lesson(data, list_learners()[0])
     seen: list[np.ndarray] = []
 
     def watch(state: object, rows: np.ndarray) -> object:
         seen.append(rows)
         return lesson.learn_fold(state, rows)  # type: ignore[arg-type]
 
-    hold_out(problem, fitted, watch)  # type: ignore[arg-type]
-    assert len(seen) == len(problem.folds)
-    for rows, fold in zip(seen, problem.folds, strict=True):
+    hold_out(data, fitted, watch)  # type: ignore[arg-type]
+    assert len(seen) == len(data.folds)
+    for rows, fold in zip(seen, data.folds, strict=True):
         assert not (rows & fold.test).any()
 
 

@@ -9,7 +9,7 @@ from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
 
 from pipeline.core import rigid
 from pipeline.core.arrays import nearest_indices
-from pipeline.estimation import Comparison, Input, Problem, fit_model
+from pipeline.estimation import EstimationData, Input, RunResiduals, fit_model
 from pipeline.estimation.prediction import predict_from
 from pipeline.models import Model, find_effect
 from pipeline.run import MotionRun, load_run
@@ -177,7 +177,7 @@ def test_the_delay_of_the_encoders_is_measured_against_the_gyro(
     wheels = tables["wheels"].with_columns(pl.col("t") + late)
     run = load(tables, wheels=wheels)
     model = Model(HUSKY, tuple(find_effect(name)() for name in SKID))
-    left = fit_model(Problem([run], HUSKY, Input.COMMAND), model).state.timing[0].wheel_delay_s
+    left = fit_model(EstimationData([run], HUSKY, Input.COMMAND), model).state.timing[0].wheel_delay_s
     # Read twenty times a second, wheels that step seem late by up to half that time.
     assert (run.alignment.wheel_delay_s > 0.0) == (late > 0.0)
     assert late - 0.02 < run.alignment.wheel_delay_s + left < late + 0.045
@@ -204,20 +204,21 @@ def test_a_fit_is_the_same_to_the_last_bit_wherever_the_map_lies_and_whenever_it
     later = {name: frame.with_columns(pl.col("t") + _LATER_S) for name, frame in stamped.items()}
     moved = {**tables, **later, "poses": _move(later["poses"])}
     recorded = load_run(tables, HUSKY, name="recorded")
-    problem, other = (
-        Problem([run], HUSKY, Input.COMMAND) for run in (recorded, load_run(moved, HUSKY, name="moved"))
+    data, other = (
+        EstimationData([run], HUSKY, Input.COMMAND)
+        for run in (recorded, load_run(moved, HUSKY, name="moved"))
     )
     model = Model(HUSKY, tuple(find_effect(name)() for name in SKID))
-    fitted = fit_model(problem, model, exact=True)
+    fitted = fit_model(data, model, exact=True)
     assert np.array_equal(fit_model(other, model, exact=True).residuals, fitted.residuals)
-    assert np.array_equal(recorded.anchored.anchored.track.path, problem.runs[0].track.path)
-    assert recorded.anchored.anchored.origin == problem.runs[0].origin
+    assert np.array_equal(recorded.anchored.anchored.track.path, data.runs[0].track.path)
+    assert recorded.anchored.anchored.origin == data.runs[0].origin
 
     effects, timing = fitted.state.effects, fitted.state.timing[0]
-    one, two = (predict_from(each.comparisons[0], effects, timing) for each in (problem, other))
+    one, two = (predict_from(each.residuals_by_run[0], effects, timing) for each in (data, other))
     assert np.allclose(one.start_times + _LATER_S, two.start_times)
     path, beyond = (made.poses[..., 0] + 1j * made.poses[..., 1] for made in (one, two))
     assert np.allclose(path * np.exp(1j * _TURNED) + _MOVED, beyond)
     assert np.allclose(one.poses[..., 2] + _TURNED, two.poses[..., 2])
-    plain = predict_from(Comparison(recorded, HUSKY, Input.COMMAND), effects, timing)
+    plain = predict_from(RunResiduals(recorded, HUSKY, Input.COMMAND), effects, timing)
     assert np.allclose(plain.poses, one.poses, atol=1e-4)

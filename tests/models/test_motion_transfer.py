@@ -5,8 +5,8 @@ import pytest
 import yaml
 from motion_runs import QUIET, simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem, carry_over, fit_model
-from pipeline.estimation.comparison import Comparison
+from pipeline.estimation import EstimationData, Input, carry_over, fit_model
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.simulate import VEHICLES, Disturbance, Program
@@ -18,8 +18,8 @@ TILE = {"effective_track": 1.8, "icr_offset": 0.12}
 def test_a_model_carries_over_to_the_same_ground_and_warns_on_ice() -> None:
     first, second = (simulate(TILE, seed=seed) for seed in (1, 2))
     ice = simulate({"effective_track": 1.4, "body_inertia": 0.9}, seed=3)
-    problem = Problem([first], HUSKY, Input.MEASURED)
-    fitted = fit_model(problem, Model(HUSKY, tuple(find_effect(name)() for name in (*TILE, "body_inertia"))))
+    data = EstimationData([first], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in (*TILE, "body_inertia"))))
     same, other = carry_over(fitted.model, [second, ice], Input.MEASURED, fitted_on=["tile"])
     assert 0.95 < same.ratio <= 1.1
     assert same.warning == ""
@@ -61,14 +61,14 @@ def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str)
     more = {} if kind == "differential" else {"vehicle": VEHICLES["car"], "program": Program(speed_scale=0.5)}
     run = simulate({}, duration_s=40.0, encoders=None, pose=QUIET, disturbance=Disturbance(), **more)
     assert run.commands is not None
-    comparison = Comparison(run, model.vehicle, Input.COMMAND, rate_hz=200.0)
-    expected = comparison.predict_velocity(model.effects, Timing())
+    run_residuals = RunResiduals(run, model.vehicle, Input.COMMAND, rate_hz=200.0)
+    expected = run_residuals.predict_velocity(model.effects, Timing())
     series = run.commands
     columns = [series.times, series.left, series.right, series.steering]
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
     # Its steps begin and end ramps a step late: at 800 Hz that is within the tolerance.
     got = run_exported(model, rows, run.duration_s, step_s=0.00125)
-    times = comparison.grid.times
+    times = run_residuals.grid.times
     for column, channel, size in ((4, "x", 0.02), (5, "y", 0.02), (6, "w", 0.02)):
         seen = np.interp(times, got[:, 0] - 0.000625, got[:, column])
         typical = float(np.sqrt(np.mean(getattr(expected, channel) ** 2)))

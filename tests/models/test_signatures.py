@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem, State
+from pipeline.estimation import EstimationData, Input, ModelState
 from pipeline.estimation.effect_signature import Signature, find_signatures
 from pipeline.models import Effect, Timing, find_effect
 from pipeline.models.effect import Parameter
@@ -24,19 +24,19 @@ TRUE: Mapping[str, tuple[str, float]] = {
 
 
 @cache
-def problem_of(name: str) -> Problem:
+def problem_of(name: str) -> EstimationData:
     """A log that was simulated with one effect alone."""
     more = {"ground": Ground(pitch_rad=0.2, roll_rad=0.1)} if name == "slope_creep" else {}
     key, value = TRUE[name]
     run = simulate({name: {key: value}}, duration_s=150.0, seed=3, **more)
-    return Problem([run], vehicle_of("husky_a200"), Input.COMMAND)
+    return EstimationData([run], vehicle_of("husky_a200"), Input.COMMAND)
 
 
 def sign(name: str, effect: Effect | None = None) -> Signature:
     """The signature in that log of its own effect, or of another one."""
     key, value = TRUE[name]
     own = find_effect(name)(**{key: value}) if effect is None else effect
-    (found,) = find_signatures(problem_of(name), State((own,), (Timing(),)))
+    (found,) = find_signatures(problem_of(name), ModelState((own,), (Timing(),)))
     return found
 
 
@@ -61,5 +61,5 @@ def test_an_effect_that_nobody_knows_has_its_signature_for_free() -> None:
 
 
 def test_an_effect_that_does_nothing_has_no_signature() -> None:
-    state = State((find_effect("effective_track")(k=1.0),), (Timing(),))
+    state = ModelState((find_effect("effective_track")(k=1.0),), (Timing(),))
     assert find_signatures(problem_of("lateral_skid"), state) == []

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation import EstimationData, Input, fit_model
 from pipeline.models import Model, find_effect
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import JointDrive
@@ -147,9 +147,9 @@ def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -
         vehicle=VEHICLES["warthog"],
         program=Program("smooth", speed_scale=0.2, turn_scale=0.25),
     )
-    problem = Problem([run], vehicle_of("warthog"), Input.COMMAND)
-    servo = fit_model(problem, Model(problem.vehicle, (find_effect("wheel_servo")(),)))
-    lag = fit_model(problem, Model(problem.vehicle, (find_effect("turn_lag")(),)))
+    data = EstimationData([run], vehicle_of("warthog"), Input.COMMAND)
+    servo = fit_model(data, Model(data.vehicle, (find_effect("wheel_servo")(),)))
+    lag = fit_model(data, Model(data.vehicle, (find_effect("turn_lag")(),)))
     found = servo.model.effect("wheel_servo").values
     for name in ("reset", "drag", "scrub", "creep"):
         assert found[name] == pytest.approx(hidden[name], rel=0.15)

@@ -15,7 +15,7 @@ from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 from verbs import run_verb
 
-from pipeline.estimation import Input, Problem, load_recording
+from pipeline.estimation import EstimationData, Input, load_recording
 from pipeline.models import Excitation, find_effect
 from pipeline.plan import Commands, Reached, choose_limits
 from pipeline.plan.plan import ExpectedGain
@@ -282,7 +282,7 @@ def test_what_a_run_reached_is_measured(speed: float, turn: float) -> None:
     made = simulate({}, duration_s=60.0, vehicle=slow, program=Program("smooth"))
     preset = find_preset("husky_a200")
     assert preset is not None
-    reached = measure_reached(Problem([made], preset, Input.COMMAND))
+    reached = measure_reached(EstimationData([made], preset, Input.COMMAND))
     assert 0.5 * speed < reached.speed_mps <= 1.01 * speed
     assert 0.5 * turn < reached.yaw_rate_radps <= 1.01 * turn
     assert 0.05 < reached.acceleration_mps2 < 3.0

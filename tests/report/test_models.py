@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Comparison, Input, Problem, State
+from pipeline.estimation import EstimationData, Input, ModelState, RunResiduals
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Model, Timing, find_effect
@@ -61,15 +61,15 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     run = load_run(tables, vehicle(), name="run")
     model = Model(vehicle(), (find_effect("effective_track")(k=1.7),))
     places = manifest.read("velocities").select("t", "x", "y")
-    problem = Problem([run], vehicle(), Input.COMMAND)
-    view = MotionStage(problem, places).view(State(model.effects, (Timing(),)), (), None)
+    data = EstimationData([run], vehicle(), Input.COMMAND)
+    view = MotionStage(data, places).view(ModelState(model.effects, (Timing(),)), (), None)
 
     shown = view.velocity.sort("t")
     at = shown["t"].to_numpy()
-    expected = predict_at_from(problem.comparisons[0], model.effects, Timing(), at)
+    expected = predict_at_from(data.residuals_by_run[0], model.effects, Timing(), at)
     assert np.allclose(shown["v_w"], expected[:, 2], atol=1e-9)
-    # The problem's run is anchored, see `MotionRun.anchored`.
-    recorded = predict_at_from(Comparison(run, vehicle(), Input.COMMAND), model.effects, Timing(), at)
+    # The data's run is anchored, see `MotionRun.anchored`.
+    recorded = predict_at_from(RunResiduals(run, vehicle(), Input.COMMAND), model.effects, Timing(), at)
     assert np.allclose(expected, recorded, atol=1e-4, equal_nan=True)
     starts = view.arcs.group_by("piece", maintain_order=True).first()
     for axis in "xy":

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import compiled
-from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.model_state import NO_PRIOR, DelayName, Free, ModelState, Prior, make_columns
 from pipeline.estimation.noise import Steps, learn_noise
-from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
+from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import average_windows, locate_windows, number_stretches
 from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_late_effect
 
@@ -51,11 +51,11 @@ class HorizonError:
     heading: Floats
 
 
-class Part(ABC):
+class PathResiduals(ABC):
     """Increments over about a fifth of a second: x [m], y [m], turn [rad].
 
     Args:
-        comparisons: runs with an input, compared by steps (`Comparison.stepped`).
+        residuals_by_run: runs with an input, compared by steps (`RunResiduals.stepped`).
         delays: delays of a run that are free in addition to the effects.
 
     Attributes:
@@ -72,7 +72,7 @@ class Part(ABC):
         dates_poses: whether its fixed clocks are those of the poses.
         clocks: ids of effects that are a clock of each single run.
         grounds: numbers of the runs on each ground; one empty group where all are on one.
-        title: name of the part.
+        title: name of the path.
     """
 
     prior: Prior = NO_PRIOR
@@ -82,40 +82,40 @@ class Part(ABC):
     channels: tuple[int, ...] = (0, 1, 2)
     title: str
 
-    def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = ()) -> None:
-        self.comparisons = tuple(comparisons)
+    def __init__(self, residuals_by_run: Sequence[RunResiduals], delays: tuple[DelayName, ...] = ()) -> None:
+        self.residuals_by_run = tuple(residuals_by_run)
         self.delays = delays
-        is_dated = len(self.comparisons) == 1 or all(c.has_gyro for c in self.comparisons)
+        is_dated = len(self.residuals_by_run) == 1 or all(c.has_gyro for c in self.residuals_by_run)
         self.clocks = () if is_dated else (find_late_effect(Late.POSES).id,)
-        self.grounds = _group_by_ground(self.comparisons)
-        windows = [comparison.windows for comparison in self.comparisons]
+        self.grounds = _group_by_ground(self.residuals_by_run)
+        windows = [run_residuals.windows for run_residuals in self.residuals_by_run]
         self.run: Ints = np.repeat(np.arange(len(windows)), [w.start.size for w in windows])
         self.times: Floats = np.concatenate([w.times for w in windows])
         self.spans: Floats = np.ascontiguousarray(self.times[:, 1] - self.times[:, 0])
         joined = [np.append(True, w.start[1:] != w.end[:-1])[: w.start.size] for w in windows]
         self.fresh: Flags = np.ascontiguousarray(np.concatenate(joined))
-        since = self.times.mean(axis=1) - np.array([c.run.start_s for c in self.comparisons])[self.run]
+        since = self.times.mean(axis=1) - np.array([c.run.start_s for c in self.residuals_by_run])[self.run]
         self.steps = Steps(self.spans, self.fresh, self.run)
         self.block = number_stretches(self.run, since, BLOCK_S)
         self.unit = number_stretches(self.run, since)
 
-    def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+    def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
         """Free numbers of a state: clocks and those of `per_run` have a value in each run."""
         return tuple(
             number
             for number in state.list_free(self.delays, (*self.clocks, *per_run), self.grounds)
-            if number.effect or self.comparisons[number.runs[0]].has_gyro
+            if number.effect or self.residuals_by_run[number.runs[0]].has_gyro
         )
 
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
-        """Whether an effect acts on this part of the path."""
+        """Whether an effect acts on this path."""
 
     @abstractmethod
-    def find_velocities(self, state: State, run: int) -> Floats:
+    def find_velocities(self, state: ModelState, run: int) -> Floats:
         """Measured less predicted mean velocities over the steps of a run, shape (m, 3)."""
 
-    def find_run_residuals(self, state: State, run: int) -> Floats:
+    def find_run_residuals(self, state: ModelState, run: int) -> Floats:
         """Measured less predicted increments of one run, shape (m, 3)."""
         return self._multiply(self.find_velocities(state, run), run)
 
@@ -124,33 +124,33 @@ class Part(ABC):
         increments: Floats = velocities * self.spans[self.run == run][:, None]
         return increments
 
-    def find_residuals(self, state: State, runs: Sequence[int] = ()) -> Floats:
+    def find_residuals(self, state: ModelState, runs: Sequence[int] = ()) -> Floats:
         """Measured less predicted increments of some runs, in order, by default of all, shape (n, 3)."""
-        residuals = [self.find_run_residuals(state, run) for run in runs or range(len(self.comparisons))]
+        residuals = [self.find_run_residuals(state, run) for run in runs or range(len(self.residuals_by_run))]
         return residuals[0] if len(residuals) == 1 else np.concatenate(residuals)
 
     @abstractmethod
     def list_clock_errors(self) -> Floats:
-        """Standard error of each run's clock that is fixed in this part [s], shape (runs,)."""
+        """Standard error of each run's clock that is fixed in this path [s], shape (runs,)."""
 
     @abstractmethod
-    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+    def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
         """Increments of one run with that clock delayed by ``late_s`` [s], shape (m, 3)."""
 
     @abstractmethod
-    def list_rolled(self, state: State) -> tuple[Floats, float]:
+    def list_rolled(self, state: ModelState) -> tuple[Floats, float]:
         """Increments that are computed from speeds of wheels by the vehicle's dimensions, shape (n, 3).
 
         Returns:
             The increments, and the sign with which they stand in the residuals; zero if dimensions cancel.
         """
 
-    def list_length_shifts(self, state: State) -> list[Floats]:
+    def list_length_shifts(self, state: ModelState) -> list[Floats]:
         """Changes of the residuals by one standard error of each estimated dimension, shape (n, 3) each.
 
         Speeds of wheels times a radius, over a track or a wheelbase, are the body's motion.
         """
-        vehicle = self.comparisons[0].context.vehicle
+        vehicle = self.residuals_by_run[0].context.vehicle
         if not vehicle.errors:
             return []
         rolled, sign = self.list_rolled(state)
@@ -165,7 +165,7 @@ class Part(ABC):
         """Increments of each run by its velocities, shape (n, 3)."""
         means = [
             average_windows(one, velocity, locate_windows(one))
-            for one, velocity in zip(self.comparisons, velocities, strict=True)
+            for one, velocity in zip(self.residuals_by_run, velocities, strict=True)
         ]
         return np.asarray(np.concatenate(means) * self.spans[:, None], dtype=np.float64)
 
@@ -174,7 +174,7 @@ class Part(ABC):
         return learn_noise(residual, self.steps, self.channels, start, exact=exact)
 
     def differentiate(
-        self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
+        self, state: ModelState, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
     ) -> Floats:
         """Derivative of the prediction by each number, shape (n, 3, p).
 
@@ -197,21 +197,25 @@ class Part(ABC):
                 columns[rows, :, index] = (residual[rows] - looks[0]) / (steps[0] - state.get(number))
         return columns
 
-    def look_ahead(self, states: Sequence[State]) -> None:
-        """Compute what is faster at once for states that are looked at next, see `Forward.look_ahead`."""
-        for run, comparison in enumerate(self.comparisons) if states else ():
-            measured = comparison.source is Input.MEASURED
+    def look_ahead(self, states: Sequence[ModelState]) -> None:
+        """Compute what is faster at once for the states looked at next, see `ForwardModel.look_ahead`."""
+        for run, run_residuals in enumerate(self.residuals_by_run) if states else ():
+            measured = run_residuals.source is Input.MEASURED
             models = list[tuple[tuple[Effect, ...], Timing]]()
             for state in states:
                 effects = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
                 timing = state.timing[run] if self.is_delayed else _NO_DELAY
-                models.append((effects, timing if measured else comparison.complete_timing(effects, timing)))
-            comparison.forward.look_ahead(models, measured=measured)
+                models.append(
+                    (effects, timing if measured else run_residuals.complete_timing(effects, timing))
+                )
+            run_residuals.forward.look_ahead(models, measured=measured)
 
     @cached_property
     def speed(self) -> float:
         """Root mean square of the speed that the input asks for, forward and sideways [m/s]."""
-        velocities = [comparison.predict_velocity((), _NO_DELAY) for comparison in self.comparisons]
+        velocities = [
+            run_residuals.predict_velocity((), _NO_DELAY) for run_residuals in self.residuals_by_run
+        ]
         squares = np.concatenate([velocity.x**2 + velocity.y**2 for velocity in velocities])
         return math.sqrt(float(squares.mean()))
 
@@ -237,63 +241,67 @@ class Part(ABC):
         return np.ones(self.run.size, dtype=np.complex128), np.zeros(self.run.size, dtype=np.complex128)
 
 
-class BodyPart(Part):
+class BodyResiduals(PathResiduals):
     """From an input to the body's motion."""
 
     def __init__(
-        self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = (), *, whole: bool = True
+        self,
+        residuals_by_run: Sequence[RunResiduals],
+        delays: tuple[DelayName, ...] = (),
+        *,
+        whole: bool = True,
     ) -> None:
-        super().__init__([comparison.stepped for comparison in comparisons], delays)
+        super().__init__([run_residuals.stepped for run_residuals in residuals_by_run], delays)
         self.whole = whole
-        if any(comparison.run.is_on_course for comparison in comparisons):
+        if any(run_residuals.run.is_on_course for run_residuals in residuals_by_run):
             # A course is the direction of travel: no lateral motion is measured.
             self.channels = (0, 2)
         self.title = "Drivetrain and ground effects" if whole else "Ground effects"
-        if any(comparison.run.is_drive_alone for comparison in comparisons):
+        if any(run_residuals.run.is_drive_alone for run_residuals in residuals_by_run):
             self.title, self.dates_poses = "Drivetrain effects", False
 
     def owns(self, effect: Effect) -> bool:
         """All effects if the input is the command; those after the wheels if it is the wheels."""
         return self.whole or effect.place > Place.DRIVE
 
-    def find_velocities(self, state: State, run: int) -> Floats:
-        """See `Part`."""
-        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
+    def find_velocities(self, state: ModelState, run: int) -> Floats:
+        """See `PathResiduals`."""
+        return self.residuals_by_run[run].find_residuals(state.effects_of(run), state.timing[run])
 
     def list_clock_errors(self) -> Floats:
-        """See `Part`: the poses relative to the gyro, or to encoders that are read periodically."""
-        return np.array([self._find_clock_error(comparison) for comparison in self.comparisons])
+        """See `PathResiduals`: the poses relative to the gyro, or to encoders that are read periodically."""
+        return np.array([self._find_clock_error(run_residuals) for run_residuals in self.residuals_by_run])
 
-    def _find_clock_error(self, comparison: Comparison) -> float:
-        if comparison.heading.gyro is not None:
-            return comparison.heading.gyro.delay_error_s
-        is_exact = self.whole and not comparison.run.is_drive_alone
-        return 0.0 if is_exact else comparison.run.wheel_period_s / _UNIFORM
+    def _find_clock_error(self, run_residuals: RunResiduals) -> float:
+        if run_residuals.heading.gyro is not None:
+            return run_residuals.heading.gyro.delay_error_s
+        is_exact = self.whole and not run_residuals.run.is_drive_alone
+        return 0.0 if is_exact else run_residuals.run.wheel_period_s / _UNIFORM
 
-    def list_rolled(self, state: State) -> tuple[Floats, float]:
-        """See `Part`: the whole prediction, unless it is that of body commands."""
+    def list_rolled(self, state: ModelState) -> tuple[Floats, float]:
+        """See `PathResiduals`: the whole prediction, unless it is that of body commands."""
         rolls = all(
             one.source is Input.MEASURED or one.run.alignment.body_multiplier is None
-            for one in self.comparisons
+            for one in self.residuals_by_run
         )
         predicted = [
             one.predict_velocity(state.effects_of(run), state.timing[run])
-            for run, one in enumerate(self.comparisons)
+            for run, one in enumerate(self.residuals_by_run)
         ]
         return self._average(predicted), -1.0 if rolls else 0.0
 
-    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
-        """See `Part`: the poses are later by ``late_s`` than assumed."""
+    def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
+        """See `PathResiduals`: the poses are later by ``late_s`` than assumed."""
         effects, timing = state.effects_of(run), state.timing[run]
-        return self._multiply(self.comparisons[run].find_residuals(effects, timing, late_s), run)
+        return self._multiply(self.residuals_by_run[run].find_residuals(effects, timing, late_s), run)
 
     @cached_property
     def _measured(self) -> tuple[Complex, Complex]:
-        seen = [comparison.measure_steps() for comparison in self.comparisons]
+        seen = [run_residuals.measure_steps() for run_residuals in self.residuals_by_run]
         return np.concatenate([one.frame for one in seen]), np.concatenate([one.moved for one in seen])
 
 
-class WheelPart(Part):
+class WheelResiduals(PathResiduals):
     """From the command to the wheels: the drivetrain, independent of the ground.
 
     Args:
@@ -309,86 +317,88 @@ class WheelPart(Part):
 
     def __init__(
         self,
-        commanded: Sequence[Comparison],
-        measured: Sequence[Comparison],
+        commanded: Sequence[RunResiduals],
+        measured: Sequence[RunResiduals],
         *,
         sideways: bool,
         exceeded: Mapping[str, float],
     ) -> None:
-        super().__init__([comparison.stepped.where_read for comparison in commanded])
+        super().__init__([run_residuals.stepped.where_read for run_residuals in commanded])
         self._exceeded = exceeded
         self.channels = (0, 1, 2) if sideways else (0, 2)
         self.measured = tuple(measured)
         self._seen: dict[tuple[int, float], Floats] = {}
-        self._spans = [locate_windows(comparison) for comparison in self.comparisons]
+        self._spans = [locate_windows(run_residuals) for run_residuals in self.residuals_by_run]
 
     def owns(self, effect: Effect) -> bool:
         """Effects on commands and in the drivetrain."""
         return effect.place <= Place.DRIVE
 
-    def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
-        """See `Part`; limits are at least what the measured wheels exceed."""
+    def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """See `PathResiduals`; limits are at least what the measured wheels exceed."""
         return tuple(self._bound(state, number) for number in super().list_free(state, per_run))
 
-    def _bound(self, state: State, number: Free) -> Free:
+    def _bound(self, state: ModelState, number: Free) -> Free:
         effect = state.find(number.effect)
         of = "" if effect is None else effect.parameter(number.name).relative_to
         low, high = number.bounds
         least = max(low, self._exceeded.get(of, low) / OVERSHOOT)
         return replace(number, bounds=(least, high)) if least < high else number
 
-    def find_velocities(self, state: State, run: int) -> Floats:
-        """See `Part`; in terms of the ideal velocity of the wheels."""
+    def find_velocities(self, state: ModelState, run: int) -> Floats:
+        """See `PathResiduals`; in terms of the ideal velocity of the wheels."""
         return self._compare(state, run, state.timing[run].wheel_delay_s)
 
-    def _compare(self, state: State, run: int, late: float) -> Floats:
+    def _compare(self, state: ModelState, run: int, late: float) -> Floats:
         """Velocities with the encoders delayed by ``late`` [s]."""
-        comparison = self.comparisons[run]
+        run_residuals = self.residuals_by_run[run]
         if (run, late) not in self._seen:
             wheels = self.measured[run].predict_velocity((), Timing(late))
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
-            self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
+            self._seen[run, late] = average_windows(run_residuals, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        driven = comparison.predict_wheels(drive, _NO_DELAY)
-        apart: Floats = self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
+        driven = run_residuals.predict_wheels(drive, _NO_DELAY)
+        apart: Floats = self._seen[run, late] - average_windows(run_residuals, driven, self._spans[run])
         return apart
 
     def list_clock_errors(self) -> Floats:
-        """See `Part`: wheels that are read periodically change at an unknown time between two readings."""
-        return np.array([comparison.run.wheel_period_s for comparison in self.comparisons]) / _UNIFORM
+        """See `PathResiduals`: wheels read periodically change at an unknown time between two readings."""
+        return (
+            np.array([run_residuals.run.wheel_period_s for run_residuals in self.residuals_by_run]) / _UNIFORM
+        )
 
-    def list_rolled(self, state: State) -> tuple[Floats, float]:
-        """See `Part`: the measured wheels, which body commands are compared with."""
+    def list_rolled(self, state: ModelState) -> tuple[Floats, float]:
+        """See `PathResiduals`: the measured wheels, which body commands are compared with."""
         seen = [
             one.predict_velocity((), Timing(state.timing[run].wheel_delay_s))
             for run, one in enumerate(self.measured)
         ]
-        is_body = all(one.run.alignment.body_multiplier is not None for one in self.comparisons)
+        is_body = all(one.run.alignment.body_multiplier is not None for one in self.residuals_by_run)
         return self._average(seen), 1.0 if is_body else 0.0
 
-    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
-        """See `Part`: the encoders are later by ``late_s`` than assumed."""
+    def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
+        """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
         return self._multiply(self._compare(state, run, state.timing[run].wheel_delay_s + late_s), run)
 
 
-def _group_by_ground(comparisons: Sequence[Comparison]) -> tuple[tuple[int, ...], ...]:
-    terrains = [one.run.terrain for one in comparisons]
+def _group_by_ground(residuals_by_run: Sequence[RunResiduals]) -> tuple[tuple[int, ...], ...]:
+    terrains = [one.run.terrain for one in residuals_by_run]
     groups = (
         tuple(run for run, one in enumerate(terrains) if one == name) for name in dict.fromkeys(terrains)
     )
     return tuple(groups) if len(set(terrains)) > 1 else ((),)
 
 
-def weigh_runs(part: Part, shares: Floats) -> Part:
-    """The same part with runs that count by their shares in its fits, shape (runs,)."""
-    weighed = copy(part)
-    weighed.weight = shares[part.run][:, None]
+def weigh_runs(path: PathResiduals, shares: Floats) -> PathResiduals:
+    """The same path with runs that count by their shares in its fits, shape (runs,)."""
+    weighed = copy(path)
+    weighed.weight = shares[path.run][:, None]
     return weighed
 
 
-def tie_prior(part: Part, prior: Prior) -> Part:
-    """The same part with a prior of its parameters."""
-    tied = copy(part)
+def tie_prior(path: PathResiduals, prior: Prior) -> PathResiduals:
+    """The same path with a prior of its parameters."""
+    tied = copy(path)
     tied.prior = prior
     return tied
 

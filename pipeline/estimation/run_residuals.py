@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.core import SILENT_S, Complex, Floats, Ints, join_parts, name_first, turn_units
 from pipeline.models import (
     Effect,
-    Forward,
+    ForwardModel,
     Late,
     Place,
     ReportEffect,
@@ -105,7 +105,7 @@ class Measured:
     turned: Floats
 
 
-class Comparison:
+class RunResiduals:
     """Comparison of a model's predictions with the measurements of one run, for one input.
 
     Attributes:
@@ -157,18 +157,18 @@ class Comparison:
         self._headings: dict[float, Floats] = {}
         self._measured: dict[float, Measured] = {}
         base = self._make_context(vehicle)
-        self.forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
+        self.forward = ForwardModel(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
         self._reaching = replace_context(self.forward, self._look_from_horizons(base))
 
     @cached_property
-    def stepped(self) -> "Comparison":
+    def stepped(self) -> "RunResiduals":
         """The same run, compared by increments that do not overlap in place of windows of half a second."""
         compared = copy(self)
         compared.windows, compared._measured = self._steps, {}  # noqa: SLF001 - its own
         return compared
 
     @property
-    def where_read(self) -> "Comparison":
+    def where_read(self) -> "RunResiduals":
         """The same run, without the windows in which its encoders were silent."""
         if not self._silences.size:
             return self
@@ -232,7 +232,7 @@ class Comparison:
         """
         return self._run(self._reaching if restarted else self.forward, effects, timing)
 
-    def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
+    def _run(self, forward: ForwardModel, effects: Sequence[Effect], timing: Timing) -> Velocity:
         own = [effect.id for effect in effects if is_own(type(effect))]
         # Formulas check themselves; values that a user's Python effect leaves undefined give one error below.
         with np.errstate(all="ignore" if own else None):

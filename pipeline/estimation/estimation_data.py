@@ -1,4 +1,4 @@
-"""Fitting problem: runs prepared for one input, to fit models and to score them on these or other runs."""
+"""Estimation data: runs prepared for one input, to fit models and to score them on these or other runs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core import Flags, Floats, Newest, SlipError, require_compiler
-from pipeline.estimation.comparison import Comparison, Input, choose_rate
-from pipeline.estimation.fit import PartFit
+from pipeline.estimation.fit import PathFit
 from pipeline.estimation.folds import Fold, find_near, make_folds
 from pipeline.estimation.largest import measure_exceeded, measure_largest
-from pipeline.estimation.parts import BodyPart, Part, WheelPart
-from pipeline.estimation.state import DelayName, State
+from pipeline.estimation.model_state import DelayName, ModelState
+from pipeline.estimation.path_residuals import BodyResiduals, PathResiduals, WheelResiduals
+from pipeline.estimation.run_residuals import Input, RunResiduals, choose_rate
 from pipeline.estimation.window_residuals import WindowResiduals
 from pipeline.models import (
     Conditions,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 FEWEST_WINDOWS = 20
 """Minimum number of windows of a fit: a model of several effects has about as many parameters."""
 _MOST_FITS = 24
-"""Number of cached fits of parts: more than the steps of a ladder of ten effects."""
+"""Number of cached fits of paths: more than the steps of a ladder of ten effects."""
 _FEWEST_DIAGNOSED = 40
 """Half seconds of driving with poses that a diagnosis needs, over all of its runs: ten seconds, windows
 overlapping."""
@@ -76,7 +76,7 @@ def _refuse_few(run: MotionRun, count: int) -> MotionError:
     )
 
 
-class Problem:
+class EstimationData:
     """Runs prepared for one input.
 
     Building one is expensive; fitting and scoring models with it is cheap.
@@ -88,13 +88,13 @@ class Problem:
         heading: source of the heading.
 
     Attributes:
-        comparisons: the runs with the input.
-        parts: parts on which parameters are fitted: the whole path, or if wheels are measured as well as
+        residuals_by_run: the runs with the input.
+        paths: paths on which parameters are fitted: the whole path, or if wheels are measured as well as
             commanded, the path from the wheels to the body and that from the command to the wheels.
         largest: the largest commands.
         exceeded: speeds that measured wheels exceed, see `measure_exceeded`.
-        fits: cached fits of a part by their starts: models with commands and with measured wheels as input
-            share the part after the wheels.
+        fits: cached fits of a path by their starts: models with commands and with measured wheels as input
+            share the path after the wheels.
 
     Raises:
         MotionError: a run lacks the input, or has too little comparable data.
@@ -113,35 +113,37 @@ class Problem:
         self.vehicle = runs[0].correct_vehicle(vehicle)
         self.source = source
         self.heading = heading
-        self.comparisons = self._compare(source)
-        counts = [comparison.windows.start.size for comparison in self.comparisons]
+        self.residuals_by_run = self._compare(source)
+        counts = [run_residuals.windows.start.size for run_residuals in self.residuals_by_run]
         if sum(counts) < FEWEST_WINDOWS or 0 in counts:
             fewest = counts.index(min(counts))
             raise _refuse_few(self.runs[fewest], counts[fewest])
         self.largest = measure_largest(self.runs, self.vehicle)
         self.exceeded = measure_exceeded(self.runs, self.vehicle)
-        self.fits = Newest[PartFit](_MOST_FITS)
+        self.fits = Newest[PathFit](_MOST_FITS)
         # A gyro determines the delay of the poses, one in any run for all; the remaining delay between poses
         # and wheels is that of the encoders.
-        gyro = any(comparison.has_gyro for comparison in self.comparisons)
+        gyro = any(run_residuals.has_gyro for run_residuals in self.residuals_by_run)
         delays: tuple[DelayName, ...] = ("wheel_delay_s",) if gyro else ()
-        self.parts: tuple[Part, ...]
+        self.paths: tuple[PathResiduals, ...]
         if source is Input.MEASURED:
-            self.parts = (BodyPart(self.comparisons, delays, whole=False),)
+            self.paths = (BodyResiduals(self.residuals_by_run, delays, whole=False),)
         elif any(run.wheels is None for run in self.runs):
-            self.parts = (BodyPart(self.comparisons),)
+            self.paths = (BodyResiduals(self.residuals_by_run),)
         else:
             self._measured = self._compare(Input.MEASURED)
             sideways = self.largest.sideways > 0.0
-            self.parts = (
-                BodyPart(self._measured, delays, whole=False),
-                WheelPart(self.comparisons, self._measured, sideways=sideways, exceeded=self.exceeded),
+            self.paths = (
+                BodyResiduals(self._measured, delays, whole=False),
+                WheelResiduals(
+                    self.residuals_by_run, self._measured, sideways=sideways, exceeded=self.exceeded
+                ),
             )
 
-    def _compare(self, source: Input) -> tuple[Comparison, ...]:
+    def _compare(self, source: Input) -> tuple[RunResiduals, ...]:
         rate = choose_rate(self.runs)
         return tuple(
-            Comparison(run, self.vehicle, source, heading=self.heading, rate_hz=rate) for run in self.runs
+            RunResiduals(run, self.vehicle, source, heading=self.heading, rate_hz=rate) for run in self.runs
         )
 
     @property
@@ -157,7 +159,7 @@ class Problem:
     @property
     def has_gyro(self) -> bool:
         """Whether every run has a good gyro as heading and clock."""
-        return all(comparison.has_gyro for comparison in self.comparisons)
+        return all(run_residuals.has_gyro for run_residuals in self.residuals_by_run)
 
     @cached_property
     def conditions(self) -> Conditions:
@@ -165,7 +167,7 @@ class Problem:
         encoders = self.has_encoders or self.is_drive_alone
         sampling = self.sampling_s if encoders else 0.0
         exceeded = self.exceeded
-        slope = max(comparison.context.slope_rad for comparison in self.comparisons)
+        slope = max(run_residuals.context.slope_rad for run_residuals in self.residuals_by_run)
         course = any(run.is_on_course for run in self.runs)
         return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope, course)
 
@@ -203,33 +205,33 @@ class Problem:
         )
 
     @cached_property
-    def behind_wheels(self) -> Problem:
+    def behind_wheels(self) -> EstimationData:
         """The same runs with their measured wheels as input; prepared data are shared."""
         if self.source is Input.MEASURED:
             return self
-        if len(self.parts) == 1:
+        if len(self.paths) == 1:
             raise MotionError(
                 "no_measured",
                 "the run has no measured wheels to feed a model with",
                 where=", ".join(self.names),
                 hint="Choose the other input.",
             )
-        problem = self.with_parts(self.parts[:1])
-        problem.source, problem.comparisons = Input.MEASURED, self._measured
-        return problem
+        data = self.with_paths(self.paths[:1])
+        data.source, data.residuals_by_run = Input.MEASURED, self._measured
+        return data
 
-    def with_parts(self, parts: tuple[Part, ...]) -> Problem:
-        """The same runs with other parts, without cached results of the former ones."""
-        problem = copy(self)
+    def with_paths(self, paths: tuple[PathResiduals, ...]) -> EstimationData:
+        """The same runs with other paths, without cached results of the former ones."""
+        data = copy(self)
         for name in ("behind_wheels", "whole", "folds", "training", "conditions"):
-            problem.__dict__.pop(name, None)
-        problem.parts = parts
-        return problem
+            data.__dict__.pop(name, None)
+        data.paths = paths
+        return data
 
     @cached_property
     def whole(self) -> WindowResiduals:
         """Residuals of the whole path, from the input to the body, in windows: errors are measured there."""
-        return WindowResiduals(self.comparisons)
+        return WindowResiduals(self.residuals_by_run)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -243,32 +245,34 @@ class Problem:
 
     @cached_property
     def training(self) -> tuple[tuple[Flags, ...], ...]:
-        """Masks of the training steps, by fold and part."""
+        """Masks of the training steps, by fold and path."""
         return tuple(
-            tuple(~find_near(part, self.whole, fold.test) for part in self.parts) for fold in self.folds
+            tuple(~find_near(path, self.whole, fold.test) for path in self.paths) for fold in self.folds
         )
 
-    def start_state(self, known: State | Sequence[Effect] = ()) -> State:
+    def start_state(self, known: ModelState | Sequence[Effect] = ()) -> ModelState:
         """A state to start from: that of a fit, or one without delays."""
-        if isinstance(known, State):
+        if isinstance(known, ModelState):
             return known
-        return State(tuple(known), (Timing(),) * len(self.runs))
+        return ModelState(tuple(known), (Timing(),) * len(self.runs))
 
     def active_effects(self, model: Model) -> tuple[Effect, ...]:
-        """Effects that can act on one of the runs, see `Comparison.list_active`."""
-        active = {one.id for comparison in self.comparisons for one in comparison.list_active(model)}
+        """Effects that can act on one of the runs, see `RunResiduals.list_active`."""
+        active = {
+            one.id for run_residuals in self.residuals_by_run for one in run_residuals.list_active(model)
+        }
         return tuple(effect for effect in model if effect.id in active)
 
-    def find_residuals(self, state: State) -> Floats:
+    def find_residuals(self, state: ModelState) -> Floats:
         """Residuals of the whole path, all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""
         return self.whole.find_residuals(state)
 
-    def find_run_residuals(self, state: State, run: int) -> Floats:
+    def find_run_residuals(self, state: ModelState, run: int) -> Floats:
         """Residuals of one run's windows."""
         return self.whole.find_run_residuals(state, run)
 
 
-def prepare_problem(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Problem:
+def prepare_data(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> EstimationData:
     """Make runs ready.
 
     Raises:
@@ -277,7 +281,7 @@ def prepare_problem(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) 
     """
     where = ", ".join(run.name for run in runs)
     try:
-        problem = Problem(runs, vehicle, source)
+        data = EstimationData(runs, vehicle, source)
     except MotionError as error:
         if error.code != f"no_{source.value}":
             raise
@@ -285,12 +289,12 @@ def prepare_problem(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) 
         what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
         raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
     _require_alike(runs)
-    windows = problem.whole.run.size
+    windows = data.whole.run.size
     if windows < _FEWEST_DIAGNOSED:
         what = f"only {windows} stretches of half a second have both a live input and valid poses"
         hint = f"{_FEWEST_DIAGNOSED} are needed: drive longer, or check the poses with `slip inspect`."
         raise DiagnosisError("too_short", what, where=where, hint=hint)
-    return problem
+    return data
 
 
 def _require_alike(runs: Sequence[MotionRun]) -> None:

@@ -118,7 +118,7 @@ class Free:
 
 
 @dataclass(frozen=True)
-class State:
+class ModelState:
     """A model with its values, run by run.
 
     Attributes:
@@ -141,7 +141,7 @@ class State:
         return next((effect for effect in self.effects if effect.id == name), None)
 
     @property
-    def centred(self) -> State:
+    def centred(self) -> ModelState:
         """The state with the mean over the runs as the shared value of what belongs to each run alone."""
         labels = {label for own in self.own.values() for label in own}
         means = {
@@ -176,19 +176,19 @@ class State:
             for effect in self.effects
         )
 
-    def add(self, *effects: Effect) -> State:
+    def add(self, *effects: Effect) -> ModelState:
         """The state with effects added, or put in the place of those with their ids."""
         new = {effect.id for effect in effects}
         others = [effect for effect in self.effects if effect.id not in new]
         ordered = sorted([*others, *effects], key=lambda effect: (effect.place, effect.rank, effect.id))
         return replace(self, effects=tuple(ordered))
 
-    def drop(self, names: Iterable[str]) -> State:
+    def drop(self, names: Iterable[str]) -> ModelState:
         """The state without some effects."""
         gone = set(names)
         return self.hold([effect for effect in self.effects if effect.id not in gone])
 
-    def hold(self, effects: Sequence[Effect]) -> State:
+    def hold(self, effects: Sequence[Effect]) -> ModelState:
         """These effects and no others, with the numbers of each run's own that the state has of them."""
         ids = {effect.id for effect in effects}
         own = {
@@ -245,7 +245,7 @@ class State:
         effect = self.find(free.effect)
         return 0.0 if effect is None else effect.parameter(free.name).neutral
 
-    def set(self, free: Free, value: float) -> State:
+    def set(self, free: Free, value: float) -> ModelState:
         """The state with another value of a free number, held to its bounds."""
         value = free.hold(value)
         if not free.effect:
@@ -261,20 +261,20 @@ class State:
         )
         return replace(self, effects=tuple(changed))
 
-    def set_clocks(self, effect: Effect, delays: Sequence[float]) -> State:
+    def set_clocks(self, effect: Effect, delays: Sequence[float]) -> ModelState:
         """The state with a delay of each run's own of an effect of it that makes something late."""
         (name,) = effect.values
         own = {run: {**self.own.get(run, {}), (effect.id, name): late} for run, late in enumerate(delays)}
         return replace(self, own=own)
 
-    def take_over(self, other: State, free: Iterable[Free]) -> State:
+    def take_over(self, other: ModelState, free: Iterable[Free]) -> ModelState:
         """The state with the values that another one has of some numbers."""
         state = self
         for number in free:
             state = state.set(number, other.get(number))
         return state
 
-    def weaken(self, names: Collection[str], share: float) -> State:
+    def weaken(self, names: Collection[str], share: float) -> ModelState:
         """The state with a share of what effects do by one number that is not linear: a limit by its inverse.
 
         Those of several numbers stay: the way from none to all of them leads through other vehicles.
@@ -307,7 +307,7 @@ class State:
         ]
         return replace(self, own=own).add(*changed)
 
-    def move(self, free: Sequence[Free], step: Sequence[float]) -> State:
+    def move(self, free: Sequence[Free], step: Sequence[float]) -> ModelState:
         """The state with free numbers changed by a step."""
         state, shared = self, dict[str, dict[str, float]]()
         for number, change in zip(free, step, strict=True):
@@ -347,7 +347,7 @@ class Prior:
 
     numbers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    def cost(self, state: State, free: Sequence[Free]) -> float:
+    def cost(self, state: ModelState, free: Sequence[Free]) -> float:
         """Cost of a state's free numbers, in units of chi-square."""
         if not self.numbers:
             return 0.0
@@ -355,7 +355,7 @@ class Prior:
         count = np.count_nonzero(known)
         return (_FREEDOM + int(count)) * float(np.log1p(known @ away**2 / _FREEDOM))
 
-    def weigh(self, state: State, free: Sequence[Free]) -> Floats:
+    def weigh(self, state: ModelState, free: Sequence[Free]) -> Floats:
         """Information on each of all free numbers, zero where nothing is known, shape (p,)."""
         if not self.numbers:
             return np.zeros(len(free))
@@ -364,11 +364,11 @@ class Prior:
         weighed: Floats = held * known
         return weighed
 
-    def pull(self, state: State, free: Sequence[Free]) -> Floats:
+    def pull(self, state: ModelState, free: Sequence[Free]) -> Floats:
         """Half the fall of the cost with each of all free numbers, shape (p,)."""
         return self.weigh(state, free) * self._compare(state, free)[0]
 
-    def _compare(self, state: State, free: Sequence[Free]) -> tuple[Floats, Floats]:
+    def _compare(self, state: ModelState, free: Sequence[Free]) -> tuple[Floats, Floats]:
         """Way from each number to its mean, and one over its variance; zeros where nothing is known."""
         pairs = [self._find(number) for number in free]
         away = [0.0 if one is None else one[0] - state.get(n) for one, n in zip(pairs, free, strict=True)]
