@@ -77,7 +77,7 @@ def _refuse_few(run: MotionRun, count: int) -> MotionError:
 
 
 class EstimationData:
-    """Runs prepared for one input.
+    """Runs of one vehicle prepared for one input: what models are fitted to, and scored on.
 
     Building one is expensive; fitting and scoring models with it is cheap.
 
@@ -88,7 +88,7 @@ class EstimationData:
         heading: source of the heading.
 
     Attributes:
-        residuals_by_run: the runs with the input.
+        residuals_by_run: measured less predicted motion of each run.
         paths: paths on which parameters are fitted: the whole path, or if wheels are measured as well as
             commanded, the path from the wheels to the body and that from the command to the wheels.
         largest: the largest commands.
@@ -113,7 +113,7 @@ class EstimationData:
         self.vehicle = runs[0].correct_vehicle(vehicle)
         self.source = source
         self.heading = heading
-        self.residuals_by_run = self._compare(source)
+        self.residuals_by_run = self._find_motion_residuals(source)
         counts = [run_residuals.windows.start.size for run_residuals in self.residuals_by_run]
         if sum(counts) < FEWEST_WINDOWS or 0 in counts:
             fewest = counts.index(min(counts))
@@ -131,7 +131,7 @@ class EstimationData:
         elif any(run.wheels is None for run in self.runs):
             self.paths = (BodyResiduals(self.residuals_by_run),)
         else:
-            self._measured = self._compare(Input.MEASURED)
+            self._measured = self._find_motion_residuals(Input.MEASURED)
             sideways = self.largest.sideways > 0.0
             self.paths = (
                 BodyResiduals(self._measured, delays, whole=False),
@@ -140,7 +140,7 @@ class EstimationData:
                 ),
             )
 
-    def _compare(self, source: Input) -> tuple[RunResiduals, ...]:
+    def _find_motion_residuals(self, source: Input) -> tuple[RunResiduals, ...]:
         rate = choose_rate(self.runs)
         return tuple(
             RunResiduals(run, self.vehicle, source, heading=self.heading, rate_hz=rate) for run in self.runs
@@ -273,7 +273,7 @@ class EstimationData:
 
 
 def prepare_data(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> EstimationData:
-    """Make runs ready.
+    """Prepare runs for a diagnosis.
 
     Raises:
         DiagnosisError: ``no_input``; ``too_short``, fewer than a quarter of a minute of driving can be

@@ -292,7 +292,7 @@ def _count_numbers(term: ResidualTerm) -> int:
 
 
 def judge_learned_term(assessment: ModelAssessment) -> ModelAssessment:
-    """The assessment of a model without a learned term, with one added."""
+    """The assessment of a model, with a learned term added."""
     below = assessment.whole
     step = make_learned_step(assessment.data, below.fitted, below.held_out)
     last = LadderStep(add_term(below.fitted, step.term), step.held_out)

@@ -1,4 +1,4 @@
-"""Parts from the commands to the motion: measured less predicted increments, as a function of a model."""
+"""Residuals of one path, drivetrain or ground: measured less predicted increments of a model."""
 
 from __future__ import annotations
 

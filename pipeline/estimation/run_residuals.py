@@ -106,12 +106,12 @@ class Measured:
 
 
 class RunResiduals:
-    """Comparison of a model's predictions with the measurements of one run, for one input.
+    """Measured less predicted motion of one run, for one input and any model.
 
     Attributes:
         run: the recording.
-        windows: displacements that are compared.
-        horizons: predictions that are compared.
+        windows: displacements whose residuals are found.
+        horizons: predictions over 2 s whose errors are found.
         heading: source of the heading.
         forward: predictions from the input.
     """

@@ -206,7 +206,7 @@ class ForwardModel:
         grid: the grid.
         context: data of the run that effects may use.
         encoders: measured wheel speeds for the initial states; None without.
-        has_gyro: whether the heading for the comparison of velocities comes from a gyro.
+        has_gyro: whether the heading of the measured velocities comes from a gyro.
     """
 
     def __init__(
