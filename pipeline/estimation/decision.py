@@ -336,7 +336,7 @@ class Search:
                     break
                 rough.append(approach(base, extension.add_to(base.state), screen.saturated.noise))
                 places -= find_cost(rough[-1]) < before  # noqa: PLW2901
-        expected = [(find_cost(one) - one.promised, one) for one in rough]
+        expected = [(find_cost(one) - one.expected_fall, one) for one in rough]
         for cost, start in sorted(expected, key=lambda pair: pair[0]):
             if cost > reached + EQUAL + _NEAR * (before - reached):
                 break

@@ -33,7 +33,7 @@ _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
 _CONVERGING = 0.3
 """Ratio of what two steps with the same derivatives promise, above which these are computed anew."""
-_MORE_THAN_PROMISED = 8.0
+_MORE_THAN_EXPECTED = 8.0
 """Falls of chi-square, in those that a step promises, that the rest of a fit may bring: of 900 fits to
 recordings, one in fifty brought more."""
 _NO_INFLUENCE = 1e-6
@@ -133,8 +133,8 @@ class PathFit:
         return max(_sum_squares(self.white.residual) / count, 1.0)
 
     @cached_property
-    def promised(self) -> float:
-        """Fall of chi-square that its next step promises."""
+    def expected_fall(self) -> float:
+        """Fall of chi-square that is expected of its next step."""
         return _solve(self, _LOOSEST)[2]
 
     @cached_property
@@ -321,11 +321,11 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
     cost = measure_cost(path, fit.noise, fit.state, free, fit.residual)
     most_cost = target - fit.noise.log_variance(path.steps, path.weight)
     for count in range(1, most + 1 if fit.smooth else 1):
-        moving, step, promised = _solve(fit, damping)
-        if is_fresh and damping <= _LOOSEST and cost - _MORE_THAN_PROMISED * promised > most_cost:
+        moving, step, expected_fall = _solve(fit, damping)
+        if is_fresh and damping <= _LOOSEST and cost - _MORE_THAN_EXPECTED * expected_fall > most_cost:
             break
         fall = 0.0
-        if promised >= enough and (is_fresh or promised < _CONVERGING * before):
+        if expected_fall >= enough and (is_fresh or expected_fall < _CONVERGING * before):
             state = fit.state.move(moving, step)
             residual = path.find_residuals(state)
             fall = cost - measure_cost(path, fit.noise, state, free, residual)
@@ -335,14 +335,14 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
             fit, cost, fallen = replace(fit, state=state, residual=residual), cost - fall, fallen + fall
             damping = max(damping / 30.0, 1e-9)
             if fall <= _NEWS:
-                is_fresh, before = False, promised
+                is_fresh, before = False, expected_fall
                 continue
-        elif is_fresh and promised >= enough and damping <= _STIFFEST:
+        elif is_fresh and expected_fall >= enough and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
             # Where limits are met, the cost is rough: there, no place is better to the last digit.
-            enough = _ENOUGH if promised < _NEWS else enough
+            enough = _ENOUGH if expected_fall < _NEWS else enough
             continue
-        elif (is_fresh or (promised < enough and not exact)) and fallen <= most_fallen:
+        elif (is_fresh or (expected_fall < enough and not exact)) and fallen <= most_fallen:
             break
         if fallen > most_fallen and not rough:
             fit = replace(fit, noise=path.learn(fit.residual, fit.noise, exact=exact))
