@@ -134,7 +134,7 @@ def snap(scale: float) -> float:
     return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
 
 
-def settle_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
+def resolve_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
     """Correct single wheels that contradict all others of a topic of joints; whether there are any."""
     section, reading = case.complete().wheels, wheels.reading
     is_free = section.factors is None and section.left is None and section.right is None
@@ -171,7 +171,7 @@ def settle_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
     return bool(factors or idle)
 
 
-def settle_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
+def resolve_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
     """Correct a side whose encoder counts on another scale than the other; whether one does."""
     reading, made = wheels.reading, wheels.reading.explained
     first, second = reading.first, reading.second
@@ -198,7 +198,7 @@ def settle_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
     return True
 
 
-def settle_wheels(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> bool:
+def resolve_wheels(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> bool:
     """Correct single encoders, the wheels read anew after each; whether signs of sides are judged."""
     if wheels is None:
         return _report_sides(case, motion, command, wheels)
@@ -208,13 +208,13 @@ def settle_wheels(case: Case, command: Candidate | None, wheels: Candidate | Non
     if leave_out(case, wheels, command, motion):
         wheels.reading.explained = None
         case.read_again(wheels, motion)
-    if settle_joints(case, wheels, motion):
+    if resolve_joints(case, wheels, motion):
         case.read_again(wheels, motion)
     is_judged = _report_sides(case, motion, command, wheels)
     if "reversed" in case.changes.get("wheels", {}):
         # What is wrong beside a side that is corrected shows now.
         is_judged = not case.read_again(wheels, motion)
-    if settle_scales(case, wheels, motion):
+    if resolve_scales(case, wheels, motion):
         case.read_again(wheels, motion)
     return is_judged
 

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.core import SlipError, enumerate_texts
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.command_scale import measure_command
-from pipeline.recording.encoders import report_dead, settle_wheels
+from pipeline.recording.encoders import report_dead, resolve_wheels
 from pipeline.recording.evidence import equal_motion
 from pipeline.recording.geometry import Geometry, Length, explain_wheels, measure_lengths, roll_wheels
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, measure_motion
@@ -22,7 +22,7 @@ from pipeline.recording.roles import (
     name_sources,
     read_drives,
     report_turn,
-    settle_stamps,
+    resolve_stamps,
 )
 from pipeline.recording.signs import (
     report_axes,
@@ -31,8 +31,8 @@ from pipeline.recording.signs import (
     report_speed_alone,
     turn_motion,
 )
-from pipeline.recording.timeouts import settle_delay, settle_timeout
-from pipeline.recording.units import correct_wheel_unit, find_units, settle_gyro, settle_lengths
+from pipeline.recording.timeouts import resolve_delay, resolve_timeout
+from pipeline.recording.units import correct_wheel_unit, find_units, resolve_gyro, resolve_lengths
 from pipeline.run import GROUND_UNOBSERVABLE, Alignment
 from pipeline.sources import (
     Configuration,
@@ -114,7 +114,7 @@ def examine(given: Given) -> Recording:
         motion = measure_motion(case.extraction.poses())
         if motion is None:
             return as_given
-        motion, gyro = settle_gyro(case, motion)
+        motion, gyro = resolve_gyro(case, motion)
     except SlipError:
         # The stage `extract` raises it again.
         return as_given
@@ -126,11 +126,11 @@ def examine(given: Given) -> Recording:
     command, wheels = choose_roles(case, drives)
     report_axes(case, command)
     report_speed_alone(case, (command, wheels))
-    settle_stamps(case, command)
-    settle_timeout(case, command, wheels, motion)
+    resolve_stamps(case, command)
+    resolve_timeout(case, command, wheels, motion)
     report_turn(case, command)
-    motion = settle_lengths(case, motion, readings, command, wheels)
-    is_judged = settle_wheels(case, command, wheels, motion)
+    motion = resolve_lengths(case, motion, readings, command, wheels)
+    is_judged = resolve_wheels(case, command, wheels, motion)
     kind = find_kind(case, wheels, motion)
     if wheels is not None and not kind and leave_out_steered(case, wheels):
         wheels = None
@@ -143,7 +143,7 @@ def examine(given: Given) -> Recording:
     if command is not None and wheels is not None:
         case.driven = explain_wheels(command.reading, wheels.reading)
     find_units(case, command, wheels)
-    settle_delay(case, command, wheels, motion)
+    resolve_delay(case, command, wheels, motion)
     report_mounting(case, (wheels, command))
     alignment = measure_command(case, command, wheels, kind)
     used = (("command", command), ("wheels", wheels))
@@ -247,14 +247,14 @@ def _stand_in(case: Case) -> Recording | None:
             wheels.reading, motion = reading, rolled
             for one in commands:
                 one.reading.explain(rolled)
-    settle_timeout(case, command, wheels, motion)
+    resolve_timeout(case, command, wheels, motion)
     if wheels.reading.form == "sides":
         report_dead(case, wheels, "the log holds no pose in its rank")
         _find_unit(case, wheels, command)
     if not case.findings or case.findings[-1].severity != "error":
         _report_opposite(case, command, wheels)
     case.driven = explain_wheels(command.reading, wheels.reading)
-    settle_delay(case, command, wheels, None)
+    resolve_delay(case, command, wheels, None)
     sources = replace(case.sources, command=command.source)
     alignment = measure_command(case, command, wheels, "ackermann" if steered else "")
     return Recording(

@@ -11,7 +11,7 @@ from pipeline.recording.case import Candidate, Case
 from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, compare, fit
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
-from pipeline.recording.units import settle_steering
+from pipeline.recording.units import resolve_steering
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import COMMANDED, CONFIGURED, DriveForm, DriveSource, Sources
 from pipeline.stages import Finding, Given, list_steered
@@ -48,8 +48,8 @@ def read_drives(case: Case, motion: Motion) -> list[Candidate]:
                 drives.append(Candidate(source, reading, rank, is_measured))
     for drive in drives:
         drive.reading.explain(motion)
-        settle_steering(case, drive, motion)
-        settle_turn(case, drive, motion)
+        resolve_steering(case, drive, motion)
+        resolve_turn(case, drive, motion)
     return _leave_out_sizes(case, drives)
 
 
@@ -258,7 +258,7 @@ def _report_command(case: Case, chosen: Candidate, other: Candidate) -> None:
     case.findings.append(Finding("role_by_motion", "info", text, where="command"))
 
 
-def settle_stamps(case: Case, command: Candidate | None) -> None:
+def resolve_stamps(case: Case, command: Candidate | None) -> None:
     """Take the times of recording of a command that is stamped after it was recorded."""
     if case.ahead is None or command is None or command.source.signals != case.ahead[0].signals:
         return
@@ -328,7 +328,7 @@ def leave_out_steered(case: Case, wheels: Candidate) -> bool:
     return True
 
 
-def settle_turn(case: Case, drive: Candidate, motion: Motion) -> None:
+def resolve_turn(case: Case, drive: Candidate, motion: Motion) -> None:
     """Read a body command as speed and steering angle where the body turns by these, as some cars do."""
     reading, made = drive.reading, drive.reading.explained
     first, second = reading.first, reading.second
@@ -368,7 +368,7 @@ def _turns_better(one: Explained, other: Explained) -> bool:
 
 
 def report_turn(case: Case, command: Candidate | None) -> None:
-    """A body command that holds steering angles; see `settle_turn`."""
+    """A body command that holds steering angles; see `resolve_turn`."""
     if command is None or not command.is_angle:
         return
     speed, turn = command.source.signals

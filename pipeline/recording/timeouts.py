@@ -64,7 +64,7 @@ class CommandTimeout:
     silences: int
 
 
-def settle_timeout(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> None:
+def resolve_timeout(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> None:
     """Hold the command as long as what follows it does.
 
     Args:
@@ -295,7 +295,7 @@ _EARLIER_S = np.arange(-3.0, DELAYS_S[0], 0.05)
 """Delays [s] of commands that are stamped after nearly all that they do."""
 
 
-def settle_delay(
+def resolve_delay(
     case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion | None
 ) -> None:
     """Correct the times of a command that acts before it is sent, and tell a dead time.

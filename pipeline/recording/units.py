@@ -30,7 +30,7 @@ _NEAR = 0.03
 """Spread of the logarithm of a gyro's scale."""
 
 
-def settle_gyro(case: Case, motion: Motion) -> tuple[Motion, Reading | None]:
+def resolve_gyro(case: Case, motion: Motion) -> tuple[Motion, Reading | None]:
     """The motion and the gyro, if there is one, fitted to it; one in degrees per second is corrected."""
     gyro = case.read_gyro()
     made = None if gyro is None else gyro.explain(motion)
@@ -48,7 +48,7 @@ def settle_gyro(case: Case, motion: Motion) -> tuple[Motion, Reading | None]:
     return motion, gyro
 
 
-def settle_lengths(
+def resolve_lengths(
     case: Case,
     motion: Motion,
     readings: Sequence[Reading],
@@ -79,7 +79,7 @@ def settle_lengths(
     return scaled
 
 
-def settle_steering(case: Case, drive: Candidate, motion: Motion) -> None:
+def resolve_steering(case: Case, drive: Candidate, motion: Motion) -> None:
     """Read a steering angle in the unit in which the body turns by it; which one it is is told later."""
     reading = drive.reading
     section = case.find_section(drive.source, is_measured=drive.is_measured)
