@@ -25,7 +25,7 @@ from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.plan import parse_area
 from pipeline.plan.next_drive import Wish, plan_drive, study
 from pipeline.plan.plan import Plan
-from pipeline.plan.plan_files import check_plan, read_promises, write_plan
+from pipeline.plan.plan_files import check_plan, read_plan, write_plan
 from pipeline.results import Named
 from pipeline.simulate import (
     Disturbance,
@@ -137,7 +137,7 @@ def _drive(
     plan: Plan, scenario: Scenario, vehicle: Vehicle, before: Recording, folder: Path, score: Score
 ) -> None:
     path = write_plan(plan, folder / "plan")[-1]
-    promised = read_promises(folder / "plan")
+    stored = read_plan(folder / "plan")
     played = read_played(path, scenario.vehicle)
     driven = replace(
         scenario, played=played, duration_s=float(played.time_s[-1]) + 0.5, seed=scenario.seed + 500_000
@@ -149,15 +149,15 @@ def _drive(
     )
     _, after = record(driven, folder / "after.mcap")
     diagnosis = diagnose_runs([before, after], vehicle).runs[0]
-    check = check_plan(promised, diagnosis)
-    score.promised, score.kept = len(check.kept), sum(one.kept for one in check.kept)
+    check = check_plan(stored, diagnosis)
+    score.promised, score.kept = len(check.answers), sum(one.is_met for one in check.answers)
     widths = [
-        one.kept
-        for answer, one in zip(promised.promises, check.kept, strict=True)
+        one.is_met
+        for answer, one in zip(stored.promises, check.answers, strict=True)
         if answer.kind == "interval"
     ]
     score.intervals, score.intervals_kept = len(widths), sum(widths)
-    score.broken = [f"{one.question}: {one.measured}" for one in check.kept if not one.kept]
+    score.broken = [f"{one.question}: {one.measured}" for one in check.answers if not one.is_met]
     score.joint = [effect.id for effect in diagnosis.effects]
     truth = set(score.truth)
     score.wrong = [effect.id for effect in diagnosis.effects if not _is_true(effect, truth)]
@@ -165,14 +165,14 @@ def _drive(
         if truth & set(group):
             score.pairs += 1
             score.decided += any(_is_true(e, truth & set(group)) for e in diagnosis.effects)
-    if promised.promises:
-        drawn = np.random.default_rng([score.seed, 23]).integers(len(promised.promises))
-        one = promised.promises[int(drawn)]
+    if stored.promises:
+        drawn = np.random.default_rng([score.seed, 23]).integers(len(stored.promises))
+        one = stored.promises[int(drawn)]
         _, cut = record(replace(driven, duration_s=one.decided_after_s), folder / "cut.mcap")
         joint = diagnose_runs([before, cut], vehicle).runs[0]
-        tested = check_plan(msgspec.structs.replace(promised, promises=[one]), joint).kept[0]
-        score.seconds, score.seconds_kept = 1, int(tested.kept)
-        if not tested.kept:
+        tested = check_plan(msgspec.structs.replace(stored, promises=[one]), joint).answers[0]
+        score.seconds, score.seconds_kept = 1, int(tested.is_met)
+        if not tested.is_met:
             score.broken.append(f"after {one.decided_after_s:g} s, {tested.question}: {tested.measured}")
 
 

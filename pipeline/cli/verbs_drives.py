@@ -222,17 +222,17 @@ def _find_vehicle(name: str | None) -> Vehicle:
 def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
     """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
+    from pipeline.plan import check_plan, read_plan, require_played  # noqa: PLC0415 - heavy
 
-    promised = read_promises(path)
+    stored = read_plan(path)
     if not names:
         what = "a check needs the log that was driven"
         raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
     drive = _gather(names, options, quiet=quiet)
     new = len(drive.recordings)
-    before = [name for name in promised.runs if name not in {*names, *(one.name for one in drive.recordings)}]
-    if promised.vehicle != drive.vehicle.id:
-        what = f"the plan is for {promised.vehicle}, and the log is of {drive.vehicle.id}"
+    before = [name for name in stored.runs if name not in {*names, *(one.name for one in drive.recordings)}]
+    if stored.vehicle != drive.vehicle.id:
+        what = f"the plan is for {stored.vehicle}, and the log is of {drive.vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
     vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
@@ -241,14 +241,14 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
         driven = [load_recording(recording, vehicle) for recording in drive.recordings]
         require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
         diagnosis = diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
-    checked = check_plan(promised, diagnosis)
+    checked = check_plan(stored, diagnosis)
     following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
     if json:
         print_json({**checked.to_json(), "next": following if diagnosis.undecided else None, "errors": []})
     elif not quiet:
         rows = [
-            f"{'met' if one.kept else 'NOT MET':<9} {one.question}: expected {one.promised}, {one.measured}"
-            for one in checked.kept
+            f"{'met' if one.is_met else 'NOT MET':<9} {one.question}: expected {one.expected}, {one.measured}"
+            for one in checked.answers
         ]
         rows += [f"open      {text}" for text in checked.open]
         rows = rows or ["the plan has no expected results"]

@@ -409,8 +409,8 @@ class _Growing(Generic[Scalar]):
         need = self._size + values.shape[0]
         if need > self._data.shape[0]:
             row = max(1, self._nothing.dtype.itemsize * int(np.prod(self._nothing.shape[1:])))
-            promised = int(min(values.shape[0] * share, _FIRST_CAPACITY // row))
-            capacity = max(need, promised, 2 * self._data.shape[0] if self._size else 0)
+            expected = int(min(values.shape[0] * share, _FIRST_CAPACITY // row))
+            capacity = max(need, expected, 2 * self._data.shape[0] if self._size else 0)
             grown = np.empty((capacity, *self._nothing.shape[1:]), dtype=self._nothing.dtype)
             grown[: self._size] = self._data[: self._size]
             self._data = grown

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
         LEAD_S,
         RATE_HZ,
         Commands,
+        DrivenRange,
         PlanError,
-        Reached,
         choose_limits,
         is_steered,
         join,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pipeline.plan.plan_files import (
         FILES,
         check_plan,
-        read_promises,
+        read_plan,
         require_played,
         write_plan,
     )

@@ -20,10 +20,10 @@ Row = tuple[str, str, str]
 
 def list_gains(plan: Plan) -> list[Row]:
     """The open questions of a plan: those that the drive answers, in their order, then the others."""
-    promised = [one for one in plan.promises if one.kind != "presence"]
+    questions = [one for one in plan.informative if one.kind != "presence"]
     duration_s = plan.commands.duration_s
-    rows = [_describe(one, duration_s) for one in promised]
-    presences = [one for one in plan.promises if one.kind == "presence"]
+    rows = [_describe(one, duration_s) for one in questions]
+    presences = [one for one in plan.informative if one.kind == "presence"]
     for is_within in (True, False):
         same = [one for one in presences if math.isfinite(one.decided_after_s) == is_within]
         if same:
@@ -34,9 +34,9 @@ def list_gains(plan: Plan) -> list[Row]:
 
 def summarize_gains(plan: Plan) -> str:
     """How many questions are open, and of how many the drive tells something."""
-    answered = sum(math.isfinite(one.decided_after_s) for one in plan.promises)
+    answered = sum(math.isfinite(one.decided_after_s) for one in plan.informative)
     parts = [f"answers {answered} of them"] if answered else []
-    if added := len(plan.promises) - answered:
+    if added := len(plan.informative) - answered:
         parts.append(f"adds to {added}")
     count = format_count(len(plan.gains), "question")
     return f"{count}; this drive {' and '.join(parts)}" if parts else count

@@ -91,7 +91,7 @@ def is_steered(vehicle: Vehicle) -> bool:
 
 
 @dataclass(frozen=True)
-class Reached:
+class DrivenRange:
     """What the driving of runs reached, each NaN where they hardly moved in this way.
 
     Attributes:
@@ -118,7 +118,7 @@ class Reached:
 
 def choose_limits(
     vehicle: Vehicle,
-    reached: Reached | None = None,
+    reached: DrivenRange | None = None,
     *,
     speed_mps: float | None = None,
     yaw_rate_radps: float | None = None,
@@ -138,7 +138,7 @@ def choose_limits(
     Raises:
         PlanError: ``no_limits``, the largest speed of the vehicle is not known.
     """
-    driven = reached or Reached()
+    driven = reached or DrivenRange()
 
     def choose(asked: float | None, done: float, most: float | None, usual: float) -> float:
         wanted = asked or (done if math.isfinite(done) else most or usual)

@@ -28,11 +28,11 @@ from pipeline.estimation.path_residuals import weigh_runs
 from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.logs import LogError, locate_recorded, open_log
 from pipeline.models import Effect, Late, Model, list_effects
-from pipeline.plan.manoeuvres import Area, Limits, Reached, choose_limits, is_steered
+from pipeline.plan.manoeuvres import Area, DrivenRange, Limits, choose_limits, is_steered
 from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question, ask_apart, ask_numbers, ask_presence, ask_undecided, list_names
-from pipeline.plan.rehearsal import Knowledge, assume, learn, measure_reached
+from pipeline.plan.rehearsal import Knowledge, assume, learn, measure_driven_range
 from pipeline.results import RunDiagnosis, find_refusal, read_suggestion
 from pipeline.run import MotionRun, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
@@ -205,7 +205,7 @@ def plan_drive(
         SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
     """
     knowledge, diagnosis = studied.knowledge, studied.diagnosis
-    reached = Reached() if knowledge.data is None else measure_reached(knowledge.data)
+    reached = DrivenRange() if knowledge.data is None else measure_driven_range(knowledge.data)
     limits = choose_limits(
         vehicle,
         reached,

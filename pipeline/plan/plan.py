@@ -126,7 +126,7 @@ class Plan:
     as_driven: tuple[str, ...] = ()
 
     @property
-    def promises(self) -> tuple[ExpectedGain, ...]:
+    def informative(self) -> tuple[ExpectedGain, ...]:
         """Questions of which the drive tells something."""
         return tuple(one for one in self.gains if one.informs)
 
@@ -162,7 +162,7 @@ class Plan:
                     "now": finite_or_none(one.now),
                     ("interval_after_s" if one.kind == "interval" else "expected_t"): one.expected,
                 }
-                for one in self.promises
+                for one in self.informative
             ],
             "impossible": [
                 {"question": one.question, "effects": list(one.effects), "because": one.needs}

@@ -1,4 +1,4 @@
-"""Files of a plan, and the comparison of its promises with the drive."""
+"""Files of a plan, and the comparison of its expected gains with the drive."""
 
 import csv
 import math
@@ -49,13 +49,13 @@ def list_types(*, steered: bool) -> tuple[str, ...]:
     return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
 
 
-class Promised(msgspec.Struct, frozen=True):
-    """Promises of a `plan.toml`, to be compared with the outcome.
+class StoredPlan(msgspec.Struct, frozen=True):
+    """Contents of a `plan.toml` that are compared with the outcome.
 
     Attributes:
         vehicle: id of the vehicle.
         runs: names of the runs that the plan is based on.
-        promises: questions that the drive answers alone.
+        promises: expected gains by question, for the drive alone.
     """
 
     vehicle: str
@@ -97,16 +97,16 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
     return tuple(folder / name for name in (*_NAMES, *([PAGE] if page else [])))
 
 
-def read_promises(path: Path) -> Promised:
-    """Promises of a `plan.toml`, or of the folder that contains it.
+def read_plan(path: Path) -> StoredPlan:
+    """Read a `plan.toml`, given itself or the folder that contains it.
 
     Raises:
         PlanError: ``no_plan``, the file is missing or is not a plan.
-        MotionError: ``unknown_effect``, a promise concerns an unknown effect.
+        MotionError: ``unknown_effect``, a question concerns an unknown effect.
     """
     file = path / _NAMES[0] if path.is_dir() else path
     try:
-        promised = msgspec.convert(parse_toml(read_bounded_text(file)), Promised)
+        stored = msgspec.convert(parse_toml(read_bounded_text(file)), StoredPlan)
     except OSError as error:
         what = f"the plan cannot be read ({error.strerror})"
     except TomlError as error:
@@ -114,9 +114,9 @@ def read_promises(path: Path) -> Promised:
     except (UnicodeDecodeError, msgspec.ValidationError):
         what = "this is not a plan.toml that `slip plan` wrote"
     else:
-        for effect in (name for answer in promised.promises for name in answer.effects):
+        for effect in (name for answer in stored.promises for name in answer.effects):
             find_effect(effect)
-        return promised
+        return stored
     raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
 
 
@@ -194,7 +194,7 @@ def _format_toml(plan: Plan) -> str:
     lines += _format_table({**asdict(plan.area), "home_m": plan.home_m})
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
-    for one in plan.promises:
+    for one in plan.informative:
         # Another diagnosis may suggest another term: what is said of it cannot be checked.
         if math.isfinite(one.decided_after_s) and SUGGESTION not in one.effects:
             lines += ["", "[[promises]]", *_format_table({name: getattr(one, name) for name in _CHECKED})]
@@ -207,42 +207,46 @@ def _format_table(table: Mapping[str, object]) -> list[str]:
 
 @dataclass(frozen=True)
 class CheckedAnswer:
-    """A promise and its outcome.
+    """An expected gain and its outcome.
 
     Attributes:
         question: as text.
-        promised: as text.
+        expected: as text.
         measured: as text.
-        kept: whether the outcome is as promised.
+        is_met: whether the outcome is as expected.
     """
 
     question: str
-    promised: str
+    expected: str
     measured: str
-    kept: bool
+    is_met: bool
 
 
 @dataclass(frozen=True)
 class Check:
-    """All promises with their outcomes, and the questions that remain open, as text."""
+    """All expected gains with their outcomes, and the questions that remain open, as text."""
 
-    kept: tuple[CheckedAnswer, ...]
+    answers: tuple[CheckedAnswer, ...]
     open: tuple[str, ...]
 
     def to_json(self) -> dict[str, object]:
         """The documented keys of `slip plan --check --json`."""
-        return {"kept": [vars(one) for one in self.kept], "open": list(self.open)}
+        rows = [
+            {"question": one.question, "promised": one.expected, "measured": one.measured, "kept": one.is_met}
+            for one in self.answers
+        ]
+        return {"kept": rows, "open": list(self.open)}
 
 
-def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
-    """Compare promises with the joint diagnosis of the earlier logs and those of the plan.
+def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
+    """Compare expected gains with the joint diagnosis of the earlier logs and those of the plan.
 
     A separation is fulfilled if no ambiguous group contains all of its effects any more and one of them is
-    identified, or all are observable and none acts; an interval if it is as narrow as promised.
+    identified, or all are observable and none acts; an interval if it is as narrow as expected.
     """
     answers = tuple(
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
-        for one in promised.promises
+        for one in plan.promises
     )
     still = [
         f"{' or '.join(group.candidates)}: {describe_separation(group)}" for group in diagnosis.undecided
@@ -261,11 +265,11 @@ def _check_separation(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedA
     is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
     if named and not is_ambiguous:
         # The identified effect explains the motion, which excludes its rival.
-        return CheckedAnswer(answer.question, text, " and ".join(named), kept=True)
+        return CheckedAnswer(answer.question, text, " and ".join(named), is_met=True)
     if is_ambiguous or asked & diagnosis.unobservable_why.keys():
-        return CheckedAnswer(answer.question, text, "still open", kept=False)
+        return CheckedAnswer(answer.question, text, "still open", is_met=False)
     # With more data the shared part of two effects may vanish: that is a decision, too.
-    return CheckedAnswer(answer.question, text, "decided: no effect", kept=True)
+    return CheckedAnswer(answer.question, text, "decided: no effect", is_met=True)
 
 
 def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
@@ -279,9 +283,9 @@ def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAns
                     answer.question,
                     text,
                     f"{value.value:.3g} ±{half:.2g}",
-                    kept=half <= answer.goal,
+                    is_met=half <= answer.goal,
                 )
-    return CheckedAnswer(answer.question, text, "not found", kept=False)
+    return CheckedAnswer(answer.question, text, "not found", is_met=False)
 
 
 _ALIKE = 0.6

@@ -19,7 +19,7 @@ from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.model_state import Free
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models import Effect, Excitation, Largest, Model, Place, Timing
-from pipeline.plan.manoeuvres import Commands, PlanError, Reached, is_steered
+from pipeline.plan.manoeuvres import Commands, DrivenRange, PlanError, is_steered
 from pipeline.run import (
     SPAN_S,
     STILL_MPS,
@@ -161,7 +161,7 @@ _MOVED = 0.05
 """Least speed [m/s], yaw rate [rad/s] and acceleration [m/s^2] that count as driving in this way."""
 
 
-def measure_reached(data: EstimationData) -> Reached:
+def measure_driven_range(data: EstimationData) -> DrivenRange:
     """What the driving of runs reached: commanded speed and yaw rate, and measured accelerations."""
     parts: dict[str, list[Floats]] = {"speed": [], "turn": [], "acceleration": [], "lateral": []}
     for run_residuals in data.residuals_by_run:
@@ -189,7 +189,7 @@ def measure_reached(data: EstimationData) -> Reached:
         return float(f"{most:.2g}") if most > _MOVED else math.nan
 
     commanded = (find(name, 1.0) for name in ("speed", "turn"))
-    return Reached(*commanded, *(find(name, _REACHED) for name in ("acceleration", "lateral")))
+    return DrivenRange(*commanded, *(find(name, _REACHED) for name in ("acceleration", "lateral")))
 
 
 def start_state(effects: Sequence[Effect]) -> ModelState:

@@ -84,7 +84,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
         safety=SAFETY,
         play=_format_play(plan),
         rows=list_gains(plan),
-        has_intervals=any(one.kind == "interval" for one in plan.promises),
+        has_intervals=any(one.kind == "interval" for one in plan.informative),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 

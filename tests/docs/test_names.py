@@ -25,6 +25,7 @@ PARTS = frozenset(
         "nurse",
     }
     | {"crew", "tell", "tells", "say", "says", "way", "reach", "around", "place", "worth", "adapt"}
+    | {"promise", "promised", "promises"}
     | {"TELL", "TELLS", "TOLD", "WORTH"}
 )
 """Words that are no part of a name: a mask, a match, a step, a residual have words of their own."""
@@ -33,11 +34,10 @@ WHOLE = frozenset({"more", "cells", "larger", "smaller", "tested", "left_out"})
 """Words that are no name alone, but fit as a part of one (`list_cells` of a table)."""
 
 PUBLIC = {
-    "pipeline/cli/verbs_drives.py": {"kept"},  # a key of the JSON of `slip plan --check`
     "pipeline/logs/other_formats.py": {"tell"},  # the method of Python's files
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"Place"},
-    "pipeline/plan/plan_files.py": {"kept"},
+    "pipeline/plan/plan_files.py": {"promises"},  # a key of plan.toml
     "pipeline/recording/roles.py": {"left"},  # a key of run.toml
     "pipeline/report/map_page.py": {"left"},  # a value of a template
     "schemas/run_tables.py": {"rung"},  # a column

@@ -33,7 +33,7 @@ from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     WHEELS,
     list_types,
-    read_promises,
+    read_plan,
     write_plan,
 )
 from pipeline.plan.questions import ask_presence
@@ -122,7 +122,7 @@ def test_the_same_request_gives_the_same_plan(plan: Plan) -> None:
     questions = ask_presence(knowledge, TURNING, find_largest(knowledge, plan.limits, 60.0))
     again = make_plan(knowledge, questions, Request(plan.limits, plan.area, 60.0, type_name=plan.type_name))
     assert again.manoeuvres == plan.manoeuvres
-    assert again.promises == plan.promises
+    assert again.informative == plan.informative
 
 
 def _read(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -166,8 +166,8 @@ def test_the_official_reader_reads_body_commands_within_the_limits(
     speed, turn = np.array([t.linear.x for t in twists]), np.array([t.angular.z for t in twists])
     _check_limits(speed, turn, _find("husky_a200"), plan)
     assert np.allclose(speed, np.loadtxt(csv, delimiter=",", skiprows=1)[:, 1], atol=1e-6)
-    promised = read_promises(toml)
-    assert [one.question for one in promised.promises] == [one.question for one in plan.promises]
+    stored = read_plan(toml)
+    assert [one.question for one in stored.promises] == [one.question for one in plan.informative]
 
 
 def test_what_a_plan_says_of_a_suggested_term_is_no_promise(plan: Plan, tmp_path: Path) -> None:
@@ -175,7 +175,7 @@ def test_what_a_plan_says_of_a_suggested_term_is_no_promise(plan: Plan, tmp_path
     seen = next(one for one in plan.gains if math.isfinite(one.decided_after_s))
     of_term = replace(seen, question="suggested_term.k_1", effects=("suggested_term",))
     toml = write_plan(replace(plan, gains=(of_term, seen)), tmp_path / "plan")[0]
-    assert [one.question for one in read_promises(toml).promises] == [seen.question]
+    assert [one.question for one in read_plan(toml).promises] == [seen.question]
 
 
 @pytest.mark.parametrize("type_name", list_types(steered=True))
@@ -223,7 +223,7 @@ def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     questions = ask_presence(knowledge, ["slope_creep", "slope_slip"], find_largest(knowledge, limits, 60.0))
     plan = make_plan(knowledge, questions, Request(limits, parse_area("20x10m", vehicle), 60.0))
     assert not plan.manoeuvres
-    assert not plan.promises
+    assert not plan.informative
     # One line for both.
     (row,) = list_gains(plan)
     assert row[0] == "slope creep and slope slip"

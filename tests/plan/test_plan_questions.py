@@ -17,11 +17,11 @@ from verbs import run_verb
 
 from pipeline.estimation import EstimationData, Input, load_recording
 from pipeline.models import Excitation, find_effect
-from pipeline.plan import Commands, Reached, choose_limits
+from pipeline.plan import Commands, DrivenRange, choose_limits
 from pipeline.plan.plan import ExpectedGain
-from pipeline.plan.plan_files import Promised, check_plan
+from pipeline.plan.plan_files import StoredPlan, check_plan
 from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation, ask_apart
-from pipeline.plan.rehearsal import Hypothesis, Rehearsal, Senses, assume, learn, measure_reached
+from pipeline.plan.rehearsal import Hypothesis, Rehearsal, Senses, assume, learn, measure_driven_range
 from pipeline.results import Named, RunDiagnosis, Undecided, Unobservable, Value
 from pipeline.simulate import Program, find_vehicle
 from pipeline.sources import find_preset
@@ -143,16 +143,16 @@ def test_promises_are_checked_against_what_came_out() -> None:
     pair = ExpectedGain("a or b", ("a", "b"), "separation", 5.0, 0.0, 6.0, 20.0, 1)
     narrow = ExpectedGain("a.k within 0.03", ("a",), "interval", 0.03, 0.1, 0.02, 20.0, 1)
     tight = replace(narrow, question="a.k within 0.01", goal=0.01, expected=0.01)
-    promised = Promised("husky", [], [pair, narrow, tight])
-    assert [one.kept for one in check_plan(promised, _diagnose(("a",))).kept] == [True, True, False]
-    still = check_plan(promised, _diagnose((), (("a", "b"),)))
-    assert [one.kept for one in still.kept] == [False, False, False]
+    plan = StoredPlan("husky", [], [pair, narrow, tight])
+    assert [one.is_met for one in check_plan(plan, _diagnose(("a",))).answers] == [True, True, False]
+    still = check_plan(plan, _diagnose((), (("a", "b"),)))
+    assert [one.is_met for one in still.answers] == [False, False, False]
     # Beside what is named a rival may not be seen: that decides; with nothing named it does not.
     hidden = {"b": Unobservable("collinear with what was named")}
-    told = check_plan(promised, msgspec.structs.replace(_diagnose(("a",)), unobservable_why=hidden)).kept[0]
-    assert (told.kept, told.measured) == (True, "a")
+    told = check_plan(plan, msgspec.structs.replace(_diagnose(("a",)), unobservable_why=hidden)).answers[0]
+    assert (told.is_met, told.measured) == (True, "a")
     assert (
-        not check_plan(promised, msgspec.structs.replace(_diagnose(), unobservable_why=hidden)).kept[0].kept
+        not check_plan(plan, msgspec.structs.replace(_diagnose(), unobservable_why=hidden)).answers[0].is_met
     )
 
 
@@ -263,7 +263,7 @@ def test_what_commands_excite_is_read_off_them() -> None:
 def test_limits_are_what_the_runs_reached() -> None:
     vehicle = find_preset("husky_a200")
     assert vehicle is not None
-    reached = Reached(0.6, 0.4, 1.7, 0.2)
+    reached = DrivenRange(0.6, 0.4, 1.7, 0.2)
     limits = choose_limits(vehicle, reached)
     assert (limits.speed_mps, limits.turn) == (0.6, 0.4)
     assert (limits.acceleration_mps2, limits.lateral_mps2) == (1.7, 0.2)
@@ -273,7 +273,7 @@ def test_limits_are_what_the_runs_reached() -> None:
     assert asked.speed_mps == vehicle.max_speed_mps
     assert (asked.acceleration_mps2, asked.lateral_mps2, asked.turn) == (0.3, 5.0, 0.4)
     # A run that only turned has reached no speed.
-    assert choose_limits(vehicle, Reached(yaw_rate_radps=0.4)).speed_mps == vehicle.max_speed_mps
+    assert choose_limits(vehicle, DrivenRange(yaw_rate_radps=0.4)).speed_mps == vehicle.max_speed_mps
 
 
 @pytest.mark.parametrize(("speed", "turn"), [(0.3, 0.5), (0.8, 0.2)])
@@ -282,7 +282,7 @@ def test_what_a_run_reached_is_measured(speed: float, turn: float) -> None:
     made = simulate({}, duration_s=60.0, vehicle=slow, program=Program("smooth"))
     preset = find_preset("husky_a200")
     assert preset is not None
-    reached = measure_reached(EstimationData([made], preset, Input.COMMAND))
+    reached = measure_driven_range(EstimationData([made], preset, Input.COMMAND))
     assert 0.5 * speed < reached.speed_mps <= 1.01 * speed
     assert 0.5 * turn < reached.yaw_rate_radps <= 1.01 * turn
     assert 0.05 < reached.acceleration_mps2 < 3.0
