@@ -301,8 +301,8 @@ def find_scale(rest: Floats) -> float:
     return math.sqrt(power)
 
 
-def list_likelihoods(rest: Floats, scale: float | None = None) -> Floats:
-    """Log-likelihood of every residual, less `LOG_PEAK`; by default with the scale that they have."""
+def list_likelihoods(rest: Floats, scale: float | Floats | None = None) -> Floats:
+    """Log-likelihood of every residual, less `LOG_PEAK`; by default with the one scale that they have."""
     scale = find_scale(rest) if scale is None else scale
     made: Floats = -np.log(scale) - 0.5 * (FREEDOM + 1.0) * np.log1p((rest / scale) ** 2 / FREEDOM)
     return made

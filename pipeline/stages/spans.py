@@ -27,7 +27,7 @@ from pipeline.core import (
     recur,
     weigh,
 )
-from pipeline.run import LIVE_SHARE, STILL_MPS
+from pipeline.run import ANSWERS_S, LIVE_SHARE, STILL_MPS
 from pipeline.sources import Vehicle
 from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal
@@ -40,7 +40,7 @@ Kind = Literal[
 _MEANS: Mapping[str, str] = {
     "emergency_stop": "the vehicle stood still under live commands: an emergency stop, or the drive was off",
     "side_stopped": "the wheels of one side stood under live commands: one was stuck, or its motor off",
-    "manual_driving": "the vehicle drove without a command: by joystick or another controller",
+    "manual_driving": "the vehicle moved without a command: by joystick, another controller, or a push",
     "pushed": "the body moved while its wheels stood still: it was pushed or carried, or slid",
     "commands_silent": "commands stopped arriving and the vehicle stopped: a watchdog, or a lost connection",
     "stuck": "the wheels turned and the body did not move: it was stuck, dug in, or was lifted",
@@ -62,6 +62,13 @@ _FEWEST_BLOCKS = 40
 """Least number of blocks for a fit of eighteen coefficients."""
 _ROUNDS = 8
 """Reweighting iterations."""
+_FEWEST_AT_REST = 8
+"""Least number of blocks at rest for the noise at rest: two of them are below their quartile."""
+_QUARTILE = 0.3186
+"""Lower quartile of absolute values of normal noise [standard deviations]: more than half of the time at rest
+may be pushed."""
+_LEAST_AT_REST = 0.1 * STILL_MPS
+"""Least noise at rest [m/s]: a fit to the whole drive expects as much of a vehicle that stands."""
 _FRICTIONS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3)
 """Fractions of the usual largest speed up to which a command may not overcome friction: the likeliest."""
 _TINY = 1e-3
@@ -309,6 +316,13 @@ class _Blocks:
         """See `price_change`."""
         return price_change(self.start.size)
 
+    def measure_rest(self, source: Floats, is_known: Flags) -> Floats:
+        """Time [s] for which a source has been at rest at the start of every block, shape (m,)."""
+        moves = (np.abs(source).sum(axis=1) > STILL_MPS) | ~is_known | self.is_first
+        index = np.arange(moves.size)
+        since = index - 1 - np.maximum.accumulate(np.where(moves, index, -1))
+        return np.asarray(BLOCK_S * np.maximum(since, 0), dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class _Fit:
@@ -319,9 +333,10 @@ class _Fit:
         friction: speed of a side up to which its motion differs, as a fraction of that.
         gains: coefficients of `_Blocks.list_columns`, shape (k, 3).
         target, expected: shape (m, 3).
-        scale: of the noise, shape (3,).
+        scale: of the noise, that at rest where the source has been at rest, shape (m, 3).
         spread: of the target itself, shape (3,).
         is_judged: blocks in which both are known, shape (m,).
+        rests: blocks in which the source has been at rest, shape (m,).
     """
 
     top: float
@@ -332,6 +347,7 @@ class _Fit:
     scale: Floats
     spread: Floats
     is_judged: Flags
+    rests: Flags
 
     @property
     def total(self) -> float:
@@ -341,7 +357,7 @@ class _Fit:
     def likelihood(self, expected: Floats) -> Floats:
         """Log-likelihood of every block if something is expected, shape (m,)."""
         return np.asarray(
-            sum(list_likelihoods(self.target[:, i] - expected[:, i], self.scale[i]) for i in range(3))
+            sum(list_likelihoods(self.target[:, i] - expected[:, i], self.scale[:, i]) for i in range(3))
         )
 
     def compare(self) -> Floats:
@@ -351,21 +367,23 @@ class _Fit:
         and its direction does not.
         """
         still, broad = (
-            np.column_stack([list_likelihoods(self.target[:, i], one[i]) for i in range(3)])
-            for one in (self.scale, self.spread)
+            np.column_stack([list_likelihoods(self.target[:, i], one[:, i]) for i in range(3)])
+            for one in (self.scale, np.broadcast_to(self.spread, self.scale.shape))
         )
         # Any direction is as likely, and the length is what follows.
         length, usual = (np.hypot(one[:, 0], one[:, 1]) for one in (self.target, self.expected))
         turned = (
-            list_likelihoods(length - usual, self.scale[0])
-            - np.log(2.0 * np.pi * np.maximum(usual, self.scale[0]))
+            list_likelihoods(length - usual, self.scale[:, 0])
+            - np.log(2.0 * np.pi * np.maximum(usual, self.scale[:, 0]))
             - LOG_PEAK
-            + list_likelihoods(self.target[:, 2] - self.expected[:, 2], self.scale[2])
+            + list_likelihoods(self.target[:, 2] - self.expected[:, 2], self.scale[:, 2])
         )
         parts = (still, broad, np.maximum(still, broad))
         made = np.column_stack((*(one.sum(axis=1) for one in parts), turned))
-        follows = self.likelihood(self.expected)[:, None]
-        return np.where(self.is_judged[:, None], made - follows, 0.0)
+        follows = self.likelihood(self.expected)
+        # What comes to rest, and stands, follows.
+        follows = np.where(self.rests, np.maximum(follows, made[:, 0]), follows)
+        return np.where(self.is_judged[:, None], made - follows[:, None], 0.0)
 
     def compare_sides(self) -> Floats:
         """The same if one side stands and the other one follows, for the right and the left, shape (m, 2)."""
@@ -396,13 +414,22 @@ def _fit(
         return None
     values, least = target[rows], _SAME * top
     spread = np.array([np.hypot(find_scale(values[:, i]), least) for i in range(3)])
+    rest = blocks.measure_rest(source, is_judged)
+    stands = target[rest >= _COASTS_S]
+    at_rest, rests = np.full(3, np.inf), rest >= ANSWERS_S
+    if len(stands) >= _FEWEST_AT_REST:
+        at_rest = np.maximum(np.quantile(np.abs(stands), 0.25, axis=0) / _QUARTILE, _LEAST_AT_REST)
     fits = []
     for friction in _FRICTIONS if is_command else _FRICTIONS[:1]:
         columns = blocks.list_columns(source, top, friction)
         solved = [_solve(columns[rows], values[:, i], least) for i in range(3)]
         gains = np.column_stack([one[0] for one in solved])
-        scale = np.hypot([find_scale(one[1]) for one in solved], least)
-        fits.append(_Fit(top, friction, gains, target, columns @ gains, scale, spread, is_judged))
+        moving = np.hypot([find_scale(one[1]) for one in solved], least)
+        expected = columns @ gains
+        # Of what comes to rest as much is unknown as is expected to be left of its motion.
+        settling = np.minimum(np.hypot(at_rest, expected), moving)
+        scale = np.where(rests[:, None], settling, moving)
+        fits.append(_Fit(top, friction, gains, target, expected, scale, spread, is_judged, rests))
     return max(fits, key=lambda one: one.total)
 
 
@@ -526,23 +553,44 @@ def _list_contradictions(
     halves = fit.compare_sides() if has_sides else gains[:, :0]
     size = np.abs(source).sum(axis=1)
     for _, part in follow_likeliest(gains[:, 2:], blocks.price):
+        first, last = part.start, part.stop - 1
         stands, free, mixed, turned = gains[part].T
+        # Where it shows, not where both stand.
+        shown = np.maximum(np.maximum(mixed, turned), 0.0)
         moved, usual = (np.hypot(one[part, 0], one[part, 1]).sum() for one in (fit.target, fit.expected))
+        is_driven = float(shown @ size[part]) > LIVE_SHARE * fit.top * float(shown.sum())
+        if not is_driven:
+            if _wanders(fit.target[part], fit.top):
+                continue
+            moves = part.start + np.flatnonzero(np.abs(fit.target[part]).sum(axis=1) > STILL_MPS)
+            first, last = int(moves[0]), int(moves[-1])
         free_as = "longer" if moved > usual else "shorter"
         sums = {"stands": stands.sum(), free_as: free.sum(), "turned": turned.sum()}
         sums["stands on one side"] = max(halves[part].sum(axis=0), default=-np.inf)
-        # Where it shows, not where both stand.
-        shown = np.maximum(np.maximum(mixed, turned), 0.0)
         made.append(
             _Contradiction(
-                float(blocks.start[part.start]),
-                float(blocks.end[part.stop - 1]),
+                float(blocks.start[first]),
+                float(blocks.end[last]),
                 float(max(mixed.sum(), turned.sum())),
-                float(shown @ size[part]) > LIVE_SHARE * fit.top * float(shown.sum()),
+                is_driven,
                 max(sums, key=lambda one: sums[one]),
             )
         )
     return made
+
+
+def _wanders(moved: Floats, top: float) -> bool:
+    """Whether the poses of a vehicle at rest wander: they are slow, and they go nowhere.
+
+    Args:
+        moved: velocities of the blocks of a span, shape (m, 3).
+        top: usual largest size of the source.
+    """
+    sizes = np.linalg.norm(moved, axis=1)
+    if sizes.mean() < STILL_MPS:
+        return True
+    goes = float(np.linalg.norm(moved.mean(axis=0))) > 0.5 * float(sizes.mean())
+    return not goes and bool(sizes.mean() < LIVE_SHARE * top)
 
 
 def _list_silent(
