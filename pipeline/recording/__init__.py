@@ -52,6 +52,7 @@ FAULTS = (
     "signs_contradict",
     "command_reversed",
     "command_of_map",
+    "commands_mixed",
     "motor_reversed",
     "wheels_reversed",
     "wheel_dead",

@@ -13,6 +13,7 @@ from pipeline.recording.evidence import equal_motion
 from pipeline.recording.geometry import Geometry, Length, explain_wheels, measure_lengths, roll_wheels
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, measure_motion
 from pipeline.recording.outages import leave_out
+from pipeline.recording.publishers import resolve_publishers
 from pipeline.recording.readings import Reading
 from pipeline.recording.roles import (
     choose_roles,
@@ -127,6 +128,7 @@ def examine(given: Given) -> Recording:
     report_axes(case, command)
     report_speed_alone(case, (command, wheels))
     resolve_stamps(case, command)
+    command = resolve_publishers(case, command, wheels)
     resolve_timeout(case, command, wheels, motion)
     report_turn(case, command)
     motion = resolve_lengths(case, motion, readings, command, wheels)

@@ -438,7 +438,7 @@ def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: 
         spans.append(OutageSection(side=one.side, start_s=first, end_s=last))  # type: ignore[arg-type]
     case.changes.setdefault("wheels", {})["ignore"] = spans
     text = (
-        f"{'; '.join(texts)}: left out, as ignore = {_write_spans(spans)} under [wheels] in run.toml "
+        f"{'; '.join(texts)}: left out, as ignore = {write_spans(spans)} under [wheels] in run.toml "
         "does; ignore = [] takes it as recorded"
     )
     begin = None if np.isinf(outages[0].start) else outages[0].start
@@ -448,7 +448,7 @@ def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: 
     return True
 
 
-def _write_spans(spans: Sequence[OutageSection]) -> str:
+def write_spans(spans: Sequence[OutageSection]) -> str:
     """As a line of TOML."""
     parts = []
     for one in spans:

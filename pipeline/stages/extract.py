@@ -643,12 +643,15 @@ class Extraction:
         )
 
     def _leave_out(self, frame: pl.DataFrame, spans: Sequence[OutageSection], *, held: bool) -> pl.DataFrame:
-        """A drive without the readings that are none: rows of it, or values that would be held."""
+        """A drive without the readings that are none: rows of it, values, or commands that are not live."""
         seconds = (frame["log_time"].to_numpy() - self.data.index.start_ns) / 1e9
         for one in spans:
             inside = np.ones(seconds.size, dtype=bool)
             inside &= True if one.start_s is None else seconds >= one.start_s
             inside &= True if one.end_s is None else seconds < one.end_s
+            if held and one.side == "both":
+                frame = frame.with_columns(active=pl.col("active") & ~pl.Series(inside))
+                continue
             sides = {one.side, "sideways"} if one.side != "both" else set(SIGNALS)
             frame = frame.with_columns(
                 pl.when(pl.Series(inside)).then(np.nan).otherwise(pl.col(name)).alias(name)

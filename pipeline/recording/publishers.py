@@ -1,0 +1,139 @@
+"""Two publishers that send commands on one topic by turns, as a joystick beside a planner does.
+
+Which of them a drive obeys depends on when it reads, so that nothing is concluded from what they ask for.
+"""
+
+import numpy as np
+
+from pipeline.core import Floats, format_share
+from pipeline.recording.case import Candidate, Case
+from pipeline.recording.outages import write_spans
+from pipeline.recording.readings import Reading
+from pipeline.run import LIVE_SHARE
+from pipeline.sources import OutageSection
+from pipeline.stages import Finding
+
+_RETURNS = 0.1
+"""Largest difference of two commands of one publisher, as a fraction of that to the other's between them."""
+_RETURNS_S = 1.0
+"""Time [s] within which both publishers send again: a slower one is a command like any other."""
+_MOST_BETWEEN = 20
+"""Largest number of messages of one publisher between two of the other."""
+_FEWEST_TURNS = 8
+"""Least number of turns in a row: nobody presses a key four times in as many seconds."""
+_RETURNING = 0.8
+"""Least share of turns that return: of values that are noise, one in five returns by chance."""
+_JOINED_S = 10.0
+"""Pause of the commands [s] in which the turns of two publishers do not show, and go on."""
+_UNEVEN = 0.3
+"""Least range of the intervals between messages [medians]: those of one publisher that switches are even."""
+_MOST = 0.5
+"""Share of the driving from which on the turns are no exception, and the command is of no use."""
+
+
+def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate | None) -> Candidate | None:
+    """Leave out where two publishers command by turns; the command, or nothing if that is nearly all."""
+    if command is None or case.complete().command.ignore is not None:
+        return command
+    reading = command.reading
+    times, asked = _read_commands(reading)
+    spans = find_turns(times, asked)
+    if not spans:
+        return command
+    live = np.linalg.norm(asked, axis=1) > 0.0
+    inside = np.logical_or.reduce([(times >= start) & (times <= end) for start, end in spans])
+    zeros = float(np.mean(~live[inside]))
+    case.extraction.vehicle = case.make_unit(command.source, "differential")
+    table = case.extraction.read_drive(command.source, case.complete().command, held=True)
+    clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
+    ends = [np.interp(span, table["t"].to_numpy(), clock).tolist() for span in spans]
+    when = f"from {ends[0][0]:.0f} to {ends[0][1]:.0f} s"
+    when += f" and in {len(ends) - 1} further stretches" if len(ends) > 1 else ""
+    text = (
+        f"two publishers send commands on {command.source} by turns {when} ({format_share(zeros)} of the "
+        "messages there are zero): which of them the drive obeys depends on when it reads; let one send at a "
+        "time (twist_mux does)"
+    )
+    if np.mean(inside[live]) < _MOST:
+        ignore = [
+            OutageSection(start_s=float(np.floor(1e2 * start) / 1e2), end_s=float(np.ceil(1e2 * end) / 1e2))
+            for start, end in ends
+        ]
+        case.changes.setdefault("command", {})["ignore"] = ignore
+        text += f": left out, as ignore = {write_spans(ignore)} under [command] in run.toml does"
+        case.findings.append(
+            Finding(
+                "command_mixed",
+                "warning",
+                f"{text}; ignore = [] takes them",
+                where="command",
+                value=zeros,
+                count=len(spans),
+            )
+        )
+        read = case.read(command.source, is_measured=False, section=case.complete().command)
+        if read is not None and reading.explained is not None:
+            read.explain(reading.explained.motion)
+            command.reading = read
+        return command
+    if wheels is None or not wheels.is_sure:
+        case.findings.append(
+            Finding("commands_mixed", "error", text, where="command", value=zeros, count=len(spans))
+        )
+        return command
+    text += f": {command.source} is not used, and the run is analyzed from its wheels"
+    case.findings.append(
+        Finding("command_mixed", "warning", text, where="command", value=zeros, count=len(spans))
+    )
+    case.leave_out(command.source)
+    return None
+
+
+def _read_commands(reading: Reading) -> tuple[Floats, Floats]:
+    """Times [s] of the commands, shape (n,), and their values over their usual sizes, shape (n, k)."""
+    times = reading.inputs[0].times if reading.inputs else np.zeros(0)
+    inputs = [one.values for one in reading.inputs if one.times.size == times.size]
+    values = np.column_stack(inputs) if inputs else np.zeros((0, 1))
+    return times, values / np.maximum(np.sqrt(np.mean(values**2, axis=0)), 1e-9) if times.size else values
+
+
+def find_turns(times: Floats, asked: Floats) -> list[tuple[float, float]]:
+    """Stretches in which two publishers send commands by turns, with their ends [s].
+
+    Every message of one that follows the other's repeats what it asked for before.
+
+    Args:
+        times: of the messages [s], increasing, shape (n,).
+        asked: commands over their usual sizes, shape (n, k).
+    """
+    if times.size <= _FEWEST_TURNS:
+        return []
+    size = np.linalg.norm(asked, axis=1)
+    steps = np.append(0.0, np.linalg.norm(np.diff(asked, axis=0), axis=1))
+    turns = steps > LIVE_SHARE * float(np.quantile(size, 0.95))
+    returns = np.zeros(times.size, dtype=bool)
+    for back in range(2, _MOST_BETWEEN + 2):
+        is_near = times[back:] - times[:-back] < _RETURNS_S
+        is_same = np.linalg.norm(asked[back:] - asked[:-back], axis=1) < _RETURNS * steps[back:]
+        returns[back:] |= is_near & is_same
+    rows = np.flatnonzero(turns)
+    # The first message of each of them returns to nothing.
+    parts = np.split(rows, 1 + np.flatnonzero(np.diff(times[rows]) > _RETURNS_S))
+    mixed = [
+        (int(part[0]), int(part[-1]))
+        for part in parts
+        if part.size >= _FEWEST_TURNS and returns[part].mean() > _RETURNING
+    ]
+    spans: list[tuple[int, int]] = []
+    for first, last in mixed:
+        if spans and times[first] - times[spans[-1][1]] < _JOINED_S:
+            spans[-1] = (spans[-1][0], last)
+        else:
+            spans.append((first, last))
+    return [(float(times[a]), float(times[b])) for a, b in spans if _is_uneven(times[a : b + 1])]
+
+
+def _is_uneven(times: Floats) -> bool:
+    """Whether the intervals between messages are those of two publishers."""
+    low, middle, high = np.quantile(np.diff(times), (0.1, 0.5, 0.9))
+    return bool(high - low > _UNEVEN * middle)
