@@ -173,9 +173,10 @@ def _is_tables(value: object) -> bool:
 
 
 def format_value(value: object) -> str:
-    """A value in TOML; lists and tables are written in one line."""
+    """A value in TOML; lists and tables are written in one line, without the values that are unknown."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {format_value(v)}" for k, v in value.items()) + " }"
+        known = {key: one for key, one in value.items() if one is not None}
+        return "{ " + ", ".join(f"{_key(k)} = {format_value(v)}" for k, v in known.items()) + " }"
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "[" + ", ".join(format_value(item) for item in value) + "]"
     if isinstance(value, float):

@@ -80,24 +80,34 @@ def resolve_timeout(case: Case, command: Candidate | None, wheels: Candidate | N
         rolled = roll_wheels(wheels.reading)
     is_sides = rolled is not None and wheels is not None and wheels.reading.form == "sides"
     width = 1.0 if is_sides else case.vehicle.kinematics.turning_width_m(case.vehicle)
-    timeout = find_timeout(command.reading, rolled or motion, 0.5 * width)
+    shown_by = rolled or motion
+    timeout = find_timeout(command.reading, shown_by, 0.5 * width)
+    bursts = None if timeout is not None else find_hold(command.reading, shown_by)
+    timeout = timeout or bursts
     if timeout is None:
         return
     hold_s = case.configuration.command.hold_s or timeout.seconds
     case.changes.setdefault("command", {})["hold_s"] = hold_s
-    case.findings.append(_report(timeout, hold_s))
+    case.findings.append(_report(timeout, hold_s, in_bursts=bursts is not None))
     command.reading = hold(command.reading, hold_s)
     command.reading.explain(motion)
 
 
-def _report(timeout: CommandTimeout, hold_s: float) -> Finding:
+def _report(timeout: CommandTimeout, hold_s: float, *, in_bursts: bool) -> Finding:
     said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
     held = "commands are held for this time"
     if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
         held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
     text = f"the base begins to stop {said} after the last command (from {timeout.silences} pauses): {held}"
+    if in_bursts:
+        text += "; commands are rarer than that, so that it drives in bursts: send them more often"
     return Finding(
-        "command_timeout", "info", text, where="command", value=timeout.seconds, count=timeout.silences
+        "command_timeout",
+        "warning" if in_bursts else "info",
+        text,
+        where="command",
+        value=timeout.seconds,
+        count=timeout.silences,
     )
 
 
@@ -134,6 +144,64 @@ def find_timeout(reading: Reading, motion: Motion, lever: float) -> CommandTimeo
     if not 0.5 * (high - low) <= _KNOWN * seconds:
         return None
     return CommandTimeout(seconds, low, high, len(silences))
+
+
+_HOLDS_S = np.array([0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0])
+"""Times [s] for which bases hold a command, .25 to 1 s by their documentation."""
+_PARTS = 8
+"""Parts into which the intervals beside the likeliest of them are divided: of a hundredth of a second."""
+_FEWEST_WAITS = 10
+"""Least number of waits between live commands, each of which ends a motion that is known from its start."""
+_WAITING = 0.2
+"""Least share of the time that is such waits: otherwise the ordinary stops decide."""
+_NATS = 1.92
+"""Loss of log-likelihood at the ends of a 95 % interval of one number."""
+
+
+def find_hold(reading: Reading, motion: Motion) -> CommandTimeout | None:
+    """Time-out of a base that waits less than its commands are apart, by likelihood; None if it has none.
+
+    A commander that sends at changes alone, or once a second, leaves no ordinary stop to compare with: the
+    base moves in bursts, which another hold time explains.
+
+    Args:
+        reading: the command.
+        motion: of the wheels, or of the body, in any unit.
+    """
+    stamps = reading.inputs[0].times if reading.inputs else np.zeros(0)
+    waits = np.diff(stamps)
+    asked = np.logical_or.reduce(
+        [one.values != 0.0 for one in reading.inputs if one.times.size == stamps.size]
+    )
+    waits = waits[asked[:-1]] if waits.size else waits
+    long = waits[waits > _HOLDS_S[0]]
+    if long.size < _FEWEST_WAITS or float(long.sum()) < _WAITING * float(np.ptp(stamps)):
+        return None
+    before = reading.explained
+    made, reading.explained = reading.explain(motion), before
+    if made is None:
+        return None
+    part, crossed = made.motion, made.crossed
+
+    def rate(seconds: float) -> Floats:
+        return hold(reading, seconds).fit_to(part, DELAYS_S, crossed=crossed).blocks
+
+    holds = _HOLDS_S[float(np.quantile(long, 0.9)) > _HOLDS_S]
+    blocks = {seconds: rate(seconds) for seconds in holds.tolist()}
+    if not blocks:
+        return None
+    best = max(blocks, key=lambda seconds: float(blocks[seconds].sum()))
+    if compare(blocks[best], made.blocks) < CLEAR:
+        return None
+    at = int(np.searchsorted(_HOLDS_S, best))
+    ends = _HOLDS_S[[max(at - 1, 0), min(at + 1, _HOLDS_S.size - 1)]]
+    for one in np.linspace(ends[0], ends[1], 2 * _PARTS + 1).tolist():
+        blocks.setdefault(one, rate(one))
+    tried, nats = np.array(sorted((one, float(each.sum())) for one, each in blocks.items())).T
+    likely = tried[nats > nats.max() - _NATS]
+    step = float(np.ptp(ends)) / (2 * _PARTS)
+    known = float(tried[np.argmax(nats)])
+    return CommandTimeout(known, float(likely[0]) - step, float(likely[-1]) + step, int(np.sum(long > known)))
 
 
 def _compare(design: Floats, times: Floats, step: float) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import pytest
 from pipeline.core import Floats
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.readings import Held, Reading
-from pipeline.recording.timeouts import CommandTimeout, find_timeout
+from pipeline.recording.timeouts import CommandTimeout, find_hold, find_timeout
 
 TIMEOUT_S = 0.5
 STEP_S = 0.02
@@ -89,3 +89,33 @@ def test_the_interval_of_few_pauses_holds_the_time_out(silences: int, stops: int
             held.append(told.low <= TIMEOUT_S <= told.high)
     assert len(held) > 0.9 * runs
     assert np.mean(held) > 0.9
+
+
+@pytest.mark.parametrize("timeout_s", [0.3, 0.5, np.inf])
+@pytest.mark.parametrize("period_s", [1.0, 2.0])
+def test_a_base_that_waits_less_than_its_commander_drives_in_bursts(
+    period_s: float, timeout_s: float
+) -> None:
+    """Commands at changes and once a second or two: no pause stands out of the others."""
+    rng = np.random.default_rng(6)
+    changes = np.cumsum(rng.uniform(1.5, 4.0, 45))
+    stamps = np.sort(np.append(changes, np.arange(0.0, changes[-1], period_s)))
+    at = np.searchsorted(changes, stamps, side="right") - 1
+    values = np.where(at >= 0, rng.uniform(-1.0, 1.0, changes.size)[at], 0.0)
+    time = np.arange(0.0, stamps[-1], STEP_S)
+    last = np.maximum(np.searchsorted(stamps, time, side="right") - 1, 0)
+    asked = np.where(time - stamps[last] < timeout_s, values[last], 0.0)
+    speed, state = np.zeros(time.size), 0.0
+    for row, one in enumerate(asked.tolist()):
+        speed[row] = state
+        state += (one - state) * STEP_S / 0.2
+    motion = roll_wheels(Reading("body", "", Held(time, speed), Held(time, 1e-3 * np.sin(time))))
+    assert motion is not None
+    command = Reading("body", "", Held(stamps, values, may_stand=True), Held(stamps, 0.0 * values))
+    found = find_hold(command, motion)
+    if np.isinf(timeout_s):
+        assert found is None
+        return
+    assert found is not None
+    assert found.low <= timeout_s <= found.high
+    assert found.seconds == pytest.approx(timeout_s, abs=0.05)
