@@ -43,6 +43,9 @@ def read_drives(case: Case, motion: Motion) -> list[Candidate]:
             reading = None if key in taken else case.read(source, is_measured=is_measured)
             if reading is None and key not in taken and is_measured and source == case.sources.wheels:
                 reading = _read_by_motion(case, source, motion)
+            if reading is None and key not in taken and source.form is DriveForm.JOINTS:
+                # A tricycle has one wheel that drives, and no sides.
+                reading = case.read(source, is_measured=is_measured, kind="ackermann")
             taken.add(key)
             if reading is not None:
                 drives.append(Candidate(source, reading, rank, is_measured))

@@ -31,6 +31,7 @@ _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
 _FRONT = re.compile(r"front|(^|[_/])(f|fl|fr|lf|rf)([_/\d]|$)")
 _REAR = re.compile(r"rear|back|(^|[_/])(rl|rr|bl|br|lr|lb|rb)([_/\d]|$)")
 _STEERS = re.compile(r"steer|azimuth")
+_DRIVES = re.compile(r"wheel|traction|drive|driving|propulsion|motor")
 _USUAL_UNITS = {
     DriveForm.SIDES: ("rad/s", "rad/s"),
     DriveForm.BODY: ("m/s", "rad/s"),
@@ -71,7 +72,7 @@ def read_joints(
         raise _no_wheels(columns.topic, ())
     velocity, position = _read_series(columns)
     joints = sorted(set(velocity) | set(position))
-    chosen = choose_sides(joints, section)
+    chosen = choose_sides(joints, section, may_steer=vehicle.kinematics.has_inputs("steering"))
     left, right = (chosen[side] for side in (SIDES[::-1] if section.exchanged else SIDES))
     findings: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(joint, velocity, position)]
@@ -96,7 +97,10 @@ def read_joints(
         if not wheels:
             raise _no_wheels(columns.topic, joints)
         speed = _to_radps(np.mean(wheels, axis=0), section, vehicle) * vehicle.wheel_radius_m
-        return {"speed": speed, "steering": steering}, findings
+        name = (*left, *right)[0].lower()
+        is_steered = len(wheels) == 1 and not any(one.search(name) for one in (_REAR, _LEFT, _RIGHT))
+        # Behind a wheel that steers and drives, as a tricycle's, less of its speed is left.
+        return {"speed": speed * np.cos(steering) if is_steered else speed, "steering": steering}, findings
     if not left or not right:
         raise _no_wheels(columns.topic, joints)
     sides = [
@@ -312,11 +316,19 @@ def list_steered(columns: TopicColumns) -> list[str]:
     return sorted(joint for joint, angle in steered.items() if angle.size and np.ptp(angle) > 0.0)
 
 
-def choose_sides(joints: Sequence[str], section: DriveSection) -> dict[str, list[str]]:
-    """The joints of each side by their names, ``left`` and ``right``, that drive and do not steer."""
+def choose_sides(
+    joints: Sequence[str], section: DriveSection, *, may_steer: bool = False
+) -> dict[str, list[str]]:
+    """The joints of each side by their names, ``left`` and ``right``, that drive and do not steer.
+
+    Of a vehicle that steers, and whose joints name no side, the one that drives is on the left.
+    """
     rolling = [joint for joint in joints if joint != section.steering_joint and not _is_steered(joint)]
     left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
     right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
+    if may_steer and not (left or right):
+        driven = [joint for joint in rolling if _DRIVES.search(joint.lower())]
+        left = driven if len(driven) == 1 else []
     return {"left": left, "right": right}
 
 

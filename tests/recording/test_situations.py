@@ -222,3 +222,39 @@ def test_wheels_of_a_known_vehicle_that_read_three_times_too_fast_are_told(tmp_p
     (told,) = [one for one in setup.choice.findings if one.id == "wheels_scaled"]
     assert told.value == pytest.approx(3.0, rel=0.02)
     assert "scale = 0.333 under [wheels]" in told.text
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("steering_joint", "traction_joint"), ("front_steer", "front_wheel"), ("azimuth_1", "drive_motor")],
+)
+@pytest.mark.parametrize("commanded", [False, True])
+def test_a_wheel_that_steers_and_drives_is_a_tricycle(
+    names: tuple[str, str], tmp_path: Path, *, commanded: bool
+) -> None:
+    """Behind it the body drives by the cosine of the steering angle, and turns by its sine."""
+    wheelbase, radius, drawn = 1.2, 0.12, draw(54)
+    bend = 0.9 * drawn.rate
+    speed, rate = drawn.speed * np.cos(bend), drawn.speed * np.sin(bend) / wheelbase
+    yaw = np.cumsum(rate) * STEP
+    place = np.cumsum(speed * np.exp(1j * yaw)) * STEP
+    noise = np.random.default_rng(1).normal(0.0, 0.002, (3, drawn.rows.size))
+    drive = replace(
+        drawn,
+        speed=speed,
+        rate=rate,
+        place=place[drawn.rows] + noise[0] + 1j * noise[1],
+        yaw=yaw[drawn.rows] + noise[2],
+    )
+    at = slice(None, None, 5)
+    steers, drives = names
+    rolled = Held(drive.time[at], drawn.speed[at] / radius)
+    joints = {steers: Held(drive.time[at], 0.0 * bend[at]), drives: rolled}
+    angles = {steers: bend[at], drives: np.cumsum(rolled.values) * STEP * 5}
+    asked = np.column_stack((speed, rate)) if commanded else np.zeros((drive.time.size, 2))
+    log = write_log(tmp_path / "log.mcap", drive, joints=joints, angles=angles, asked=asked)
+    setup = set_up_log(log, Options(out=tmp_path))
+    assert setup.vehicle.kind == "ackermann"
+    assert setup.sources.wheels is not None
+    assert setup.vehicle.wheelbase_m == pytest.approx(wheelbase, rel=0.02)
+    assert setup.vehicle.wheel_radius_m == pytest.approx(radius, rel=0.02)
