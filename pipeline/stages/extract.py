@@ -385,7 +385,7 @@ class Extraction:
             return position, quaternion
         position, quaternion, steepest, angle = leaning
         text = (
-            f"the poses of {source.topic} know no slope: roll, pitch and height are by the orientations of "
+            f"the poses of {source.topic} know no slope: roll, pitch and height are by "
             f"{imu.columns.topic}, up to {np.degrees(steepest):.0f} degrees"
         )
         if angle:

@@ -1,8 +1,9 @@
-"""Slopes under poses in the plane, by an orientation of an IMU.
+"""Slopes under poses in the plane, by the orientation of an IMU, or by its accelerations alone.
 
 A localization in the plane, or a receiver's course, knows a heading and no slope: where the ground is not
 level, roll and pitch are those of the IMU, and the height follows from them along the path. Its specific
-force, which is gravity and the acceleration of the body, tells which way it is mounted.
+force, which is gravity and the acceleration of the body, tells which way it is mounted. Of an IMU without
+orientations, roll and pitch are those of its specific force less the acceleration of the poses.
 """
 
 import numpy as np
@@ -17,6 +18,8 @@ _LEAST_RAD = np.radians(3.0)
 level floor, starts and stops feign a degree or two."""
 _UNIT = 0.1
 """Deviation of an orientation's length from one: a sensor without one gives zeros."""
+_G = 9.81
+"""Gravity [m/s^2]."""
 _UPRIGHT = 0.9
 """Share of the specific force that is upward where an orientation belongs to it: the rest is acceleration."""
 _WINDOW_S = 1.0
@@ -27,6 +30,8 @@ _ONE_WAY = 0.5
 """Length of the mean direction of the driving above which one direction prevails."""
 _PARTS, _SURE = 8, 3.0
 """Parts of the way by which the error of a mounting is estimated, and how many errors it must be."""
+_ASKEW, _MOST_OFF = 0.25, 0.5
+"""Largest standard error of a turn that tells a mounting, 14 degrees, and of its size: poses smooth it."""
 _TURNED_RAD = np.radians(30.0)
 """Least angle of a mounting [rad]: nobody mounts an IMU askew by less and says nothing, and noise may."""
 
@@ -40,7 +45,7 @@ def lean(
         times: of the poses [s], shape (n,).
         position: shape (n, 3) [m].
         quaternion: shape (n, 4).
-        imu: orientations with their clock.
+        imu: orientations, or specific forces alone, with their clock.
         turn: orientation of the body in the IMU's frame, shape (4,); None where nothing says it.
 
     Returns:
@@ -48,28 +53,20 @@ def lean(
         the IMU's x axis where only its accelerations tell it, else zero [rad].
     """
     roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
-    attitude = reading.read_attitude(imu.columns)
-    if attitude is None or max(_span(roll), _span(pitch)) > _LEVEL_RAD:
+    if max(_span(roll), _span(pitch)) > _LEVEL_RAD:
         return None
-    force = reading.read_imu(imu.columns)[1][imu.order]
-    attitude, at = attitude[imu.order], imu.times[imu.order]
-    known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
-    if known.sum() < reading.FEWEST_MESSAGES:
+    at, force, attitude = _read(imu)
+    if at.size < reading.FEWEST_MESSAGES:
         return None
-    attitude, at, force = attitude[known], at[known], force[known]
     body, inside = _measure_acceleration(times, position, yaw, at)
-    angle = 0.0
-    if turn is None:
-        if not _is_of_force(attitude, force):
-            return None
-        roll, pitch, _ = rigid.euler_from_quaternions(attitude)
-        level = rigid.rotate(rigid.quaternions_from_euler(roll, pitch, np.zeros(roll.size)), force)
-        felt = _smooth(at[inside], (level[:, 0] + 1j * level[:, 1])[inside])
-        # A turned sensor feels what the body does, turned back.
-        turned = float(np.angle(np.vdot(felt, body)))
-        angle = turned if _share(felt, body) > _FOLLOWS and abs(turned) > _TURNED_RAD else 0.0
-        turn = rigid.quaternions_from_yaw(np.array([-angle]))[0]
-    tilts = np.array(rigid.euler_from_quaternions(rigid.multiply_quaternions(attitude, turn[None]))[:2])
+    if attitude is not None:
+        made = _lean_by_attitude(attitude, force, at, turn, body, inside)
+    else:
+        made = _lean_by_force(force[inside], at[inside], turn, body)
+        at, inside = at[inside], inside[inside]
+    if made is None:
+        return None
+    tilts, angle = made
     # A filter that takes accelerations for gravity leans where the body speeds up.
     if _share(_smooth(at[inside], (1j * tilts[0] - tilts[1])[inside]), body) > _FOLLOWS:
         return None
@@ -86,6 +83,87 @@ def lean(
         height = position[0, 2] + np.append(0.0, np.cumsum(np.nan_to_num(risen)))
         position = np.column_stack((position[:, :2], np.where(np.isfinite(position[:, 2]), height, np.nan)))
     return position, leaning, float(np.abs([low, high]).max()), angle
+
+
+def _read(imu: reading.Receiver) -> tuple[Floats, Floats, Floats | None]:
+    """Times [s], specific forces (m, 3) and orientations (m, 4) of an IMU; None if it has no orientations."""
+    at, force = imu.times[imu.order], reading.read_imu(imu.columns)[1][imu.order]
+    attitude = reading.read_attitude(imu.columns)
+    if attitude is not None:
+        attitude = attitude[imu.order]
+        known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
+        # A sensor without one repeats the first that it had.
+        if known.sum() >= reading.FEWEST_MESSAGES and np.ptp(attitude[known], axis=0).any():
+            return at[known], force[known], attitude[known]
+    known = np.isfinite(force).all(axis=1)
+    return at[known], force[known], None
+
+
+def _lean_by_attitude(
+    attitude: Floats, force: Floats, at: Floats, turn: Floats | None, body: Complex, inside: Flags
+) -> tuple[Floats, float] | None:
+    """Roll and pitch of the body [rad], shape (2, m), and the angle of the mounting, by orientations."""
+    angle = 0.0
+    if turn is None:
+        if not _is_of_force(attitude, force):
+            return None
+        roll, pitch, _ = rigid.euler_from_quaternions(attitude)
+        level = rigid.rotate(rigid.quaternions_from_euler(roll, pitch, np.zeros(roll.size)), force)
+        felt = _smooth(at[inside], (level[:, 0] + 1j * level[:, 1])[inside])
+        angle = _find_angle(felt, body)
+        turn = rigid.quaternions_from_yaw(np.array([-angle]))[0]
+    return np.array(rigid.euler_from_quaternions(rigid.multiply_quaternions(attitude, turn[None]))[:2]), angle
+
+
+def _lean_by_force(
+    force: Floats, at: Floats, turn: Floats | None, body: Complex
+) -> tuple[Floats, float] | None:
+    """Roll and pitch of the body [rad], shape (2, m), and the angle of the mounting, by specific forces.
+
+    None where they are not those of gravity, or where nothing shows how their sensor is mounted.
+    """
+    if at.size < reading.FEWEST_MESSAGES or abs(np.median(np.linalg.norm(force, axis=1)) / _G - 1.0) > _UNIT:
+        return None
+    if turn is not None:
+        force = rigid.rotate(np.broadcast_to(rigid.invert_quaternions(turn[None]), (at.size, 4)), force)
+    means = np.column_stack([_average(at, part) for part in force.T])
+    if means[:, 2].mean() < _UPRIGHT * _G:
+        return None
+    level = means[:, 0] + 1j * means[:, 1]
+    angle = 0.0
+    if turn is None:
+        # Slopes change slowly, and what speeds up and slows down does not.
+        late = arrays.count_steps(at, _WINDOW_S)
+        gain, error = _measure_gain(level[late:] - level[:-late], body[late:] - body[:-late])
+        if error > _ASKEW * abs(gain) or not 1.0 - _MOST_OFF < abs(gain) < 1.0 + _MOST_OFF:
+            return None
+        angle = float(-np.angle(gain))
+        angle = angle if abs(angle) > _TURNED_RAD else 0.0
+        level = level * np.exp(1j * angle)
+    gravity = level - body
+    return np.array((np.arctan2(gravity.imag, means[:, 2]), np.arctan2(-gravity.real, means[:, 2]))), angle
+
+
+def _measure_gain(felt: Complex, body: Complex) -> tuple[complex, float]:
+    """What a sensor feels over what a body does, a turn where it is mounted askew, and its standard error."""
+    parts = np.arange(body.size) * _PARTS // max(body.size, 1)
+    both, own = (
+        np.array([np.vdot(body[parts == number], one[parts == number]) for number in range(_PARTS)])
+        for one in (felt, body)
+    )
+    if not own.sum().real > 0.0:
+        return 0.0, np.inf
+    # The ground of one part of the way is not that of another (jackknife).
+    others = (both.sum() - both) / np.maximum((own.sum() - own).real, 1e-12)
+    spread = float(np.mean(np.abs(others - others.mean()) ** 2))
+    return complex(both.sum() / own.sum().real), float(np.sqrt((_PARTS - 1.0) * spread))
+
+
+def _find_angle(felt: Complex, body: Complex) -> float:
+    """Angle from ahead to a sensor's x axis by what it feels of a body's acceleration; zero if not clear."""
+    # A turned sensor feels what the body does, turned back.
+    turned = float(np.angle(np.vdot(felt, body)))
+    return turned if _share(felt, body) > _FOLLOWS and abs(turned) > _TURNED_RAD else 0.0
 
 
 def _is_of_force(attitude: Floats, force: Floats) -> bool:
@@ -124,9 +202,14 @@ def _smooth(at: Floats, values: Complex) -> Complex:
     if at.size < reading.FEWEST_MESSAGES:
         return np.zeros(at.size, dtype=np.complex128)
     known = np.nan_to_num(values)
-    summed = np.column_stack([arrays.integrate_rate(at, part) for part in (known.real, known.imag)])
-    means = join_parts(*arrays.differentiate_locally(at, at, summed, 2.0 * _WINDOW_S).T)
+    means = join_parts(_average(at, known.real), _average(at, known.imag))
     return np.asarray(means - means.mean())
+
+
+def _average(at: Floats, values: Floats) -> Floats:
+    """Means over windows as those of the acceleration, shape (m,)."""
+    summed = arrays.integrate_rate(at, values)[:, None]
+    return np.asarray(arrays.differentiate_locally(at, at, summed, 2.0 * _WINDOW_S)[:, 0])
 
 
 def _share(one: Complex, other: Complex) -> float:

@@ -29,8 +29,13 @@ def record_poses(drive: DrawnDrive, pitch: float = 0.0) -> DrawnTopic:
     return record_cdr(drive, "/amcl/pose", "geometry_msgs/msg/PoseStamped", fields)
 
 
-def record_imu(drive: DrawnDrive, slope: float, *, turned: bool = False, down: bool = False) -> DrawnTopic:
-    """Orientations on a plane that rises to the north, in an IMU that looks ahead, or to the left."""
+def record_imu(
+    drive: DrawnDrive, slope: float, *, turned: bool = False, down: bool = False, oriented: bool = True
+) -> DrawnTopic:
+    """Orientations on a plane that rises to the north, in an IMU that looks ahead, or to the left.
+
+    Without orientations it has accelerations with a noise of .5 m/s^2 and a bias of .1 m/s^2.
+    """
     normal = np.array([0.0, -np.sin(slope), np.cos(slope)])
     # In the frame of the heading, which is of a magnetometer that is a radian off.
     ahead, left = normal[1] * np.sin(drive.yaw), normal[1] * np.cos(drive.yaw)
@@ -46,7 +51,13 @@ def record_imu(drive: DrawnDrive, slope: float, *, turned: bool = False, down: b
     gravity = rigid.rotate(
         rigid.invert_quaternions(body), np.broadcast_to([0.0, 0.0, -9.81 if down else 9.81], moved.shape)
     )
-    fields |= {f"linear_acceleration.{name}": (moved + gravity)[:, i] for i, name in enumerate("xyz")}
+    force = moved + gravity
+    if not oriented:
+        # As of a driver that fills in no orientation and says so by the covariance.
+        fields |= {f"orientation.{name}": 0.0 * drive.yaw for name in "xyz"}
+        fields |= {"orientation.w": 1.0 + 0.0 * drive.yaw}
+        force = force + np.random.default_rng(3).normal(0.1, 0.5, force.shape)
+    fields |= {f"linear_acceleration.{name}": force[:, i] for i, name in enumerate("xyz")}
     return record_cdr(drive, "/imu/data", "sensor_msgs/msg/Imu", fields)
 
 
@@ -77,6 +88,30 @@ def test_slope_and_height_of_poses_in_the_plane_are_those_of_an_imu(
     said = read_findings(log)["slope_by_imu"]
     assert "up to 12 degrees" in said
     assert ("90 degrees to the left of ahead" in said) == (turned and not is_known)
+
+
+@pytest.mark.parametrize(
+    ("turned", "is_known"), [(False, False), (True, True), (True, False)], ids=["ahead", "told", "felt"]
+)
+def test_accelerations_alone_tell_a_slope(tmp_path: Path, *, turned: bool, is_known: bool) -> None:
+    """Less those of the poses they are gravity, averaged over two seconds."""
+    drive, slope = draw_drive(120.0), np.radians(12.0)
+    imu = record_imu(drive, slope, turned=turned, oriented=False)
+    topics = [record_twist(drive), record_poses(drive), imu, *([record_mounting(drive)] if is_known else [])]
+    log = write_drawn(tmp_path / "log.mcap", *topics)
+    poses = extract_drawn(log)
+    quaternion = poses.select("q_x", "q_y", "q_z", "q_w").to_numpy()
+    up = rigid.rotate(quaternion, np.broadcast_to([0.0, 0.0, 1.0], (poses.height, 3)))
+    off = up - np.array([0.0, -np.sin(slope), np.cos(slope)])
+    assert np.sqrt(np.mean(off**2, axis=0)).max() < 0.04
+    assert "slope_by_imu" in read_findings(log)
+
+
+def test_accelerations_on_a_floor_tell_no_slope(tmp_path: Path) -> None:
+    drive = draw_drive(120.0)
+    topic = record_imu(drive, 0.0, oriented=False)
+    poses = extract_drawn(write_drawn(tmp_path / "log.mcap", record_twist(drive), record_poses(drive), topic))
+    assert (poses["z"] == 0.0).all()
 
 
 def test_an_orientation_that_is_not_of_its_specific_force_tells_no_slope(tmp_path: Path) -> None:
