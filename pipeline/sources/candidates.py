@@ -245,6 +245,7 @@ _UPSTREAM = re.compile(
 )
 _EXECUTED = re.compile(r"executed|cmd_vel_out|limited")
 _SATELLITES = re.compile(r"gps|gnss|navsat|nmea|rtk|ublox|septentrio|novatel|fix[_/]?vel")
+_LEFT = re.compile(r"left|(?<![a-z])(?:l|fl|rl|bl|ml|lf|lr|lb|lm)(?![a-z])|(?<![a-z])l(?=wheel|motor)")
 _FORMS = {"sides": DriveForm.SIDES, "body": DriveForm.BODY, "steering": DriveForm.STEERING}
 
 Ranked = tuple[float, DriveSource]
@@ -390,17 +391,14 @@ class Topics:
                     yield 3.3, DriveSource(_FORMS[pair.form], signals, "a pair of topics by their names")
 
     def pairs_of_sides(self) -> list[tuple[str, str]]:
-        """Topics of one number whose names differ in left and right."""
+        """Topics of one number whose names differ in left and right, or in fl and fr, rl and rr."""
         free = {
             topic
             for topic, number in self.numbers().items()
             if not number.quantity and not any(end.search(topic.lower()) for end in ELECTRIC.values())
         }
-        return [
-            (topic, topic.replace("left", "right"))
-            for topic in sorted(free)
-            if "left" in topic and topic.replace("left", "right") in free
-        ]
+        pairs = [(topic, _LEFT.sub(_name_right, topic)) for topic in sorted(free)]
+        return [pair for pair in pairs if pair[0] != pair[1] and pair[1] in free]
 
     def pairs_of_speed_and_steering(self) -> list[tuple[str, str]]:
         """Topics of one number whose names differ in speed (or velocity) and steering."""
@@ -412,6 +410,11 @@ class Topics:
             for turn in ("steering_angle", "steering", "steer")
             if turn in topic and (speed := topic.replace(turn, word)) in free
         ]
+
+
+def _name_right(left: re.Match[str]) -> str:
+    """The word for the right side in place of one for the left."""
+    return "right" if left[0] == "left" else left[0].replace("l", "r")
 
 
 def _signal(topic: str, number: NumberField) -> Signal:

@@ -425,3 +425,15 @@ def test_a_difference_of_wheels_of_an_unknown_track_says_at_which_it_is(tmp_path
     odometry = record_cdr(robot.does, "/wheel_odom/twist", TWIST, stamp_ros(robot.does) | turning)
     setup = set_up(tmp_path, robot.command(), odometry, robot.pose())
     assert "a difference of the wheels is that at a track of 0.5 m" in told(setup)
+
+
+@pytest.mark.parametrize("name", ["/wheel_{}_rpm", "/motors/{}/speed", "/{}wheel_vel"])
+def test_topics_of_single_wheels_are_paired_by_short_names(name: str, tmp_path: Path) -> None:
+    robot = Robot()
+    sides = ("l", "r") if name.startswith("/{") else ("fl", "fr")
+    topics = [
+        robot.number(name.format(side), speed) for side, speed in zip(sides, robot.wheels.T, strict=True)
+    ]
+    setup = set_up(tmp_path, record_twist(robot.asked), *topics, robot.pose())
+    assert setup.sources.wheels is not None
+    assert [signal.topic for signal in setup.sources.wheels.signals] == [name.format(side) for side in sides]
