@@ -260,17 +260,16 @@ def _begin(
 
 
 def _differentiate(fit: PathFit, base: PathFit | None = None, *, exact: bool = False) -> PathFit:
-    """The fit with its derivatives; those by the numbers of a smaller model are taken from that one."""
-    known = {} if base is None else {number.key: index for index, number in enumerate(base.free)}
+    """The fit with its derivatives anew; those by the numbers of a smaller model stay as they are."""
+    known = set() if base is None else {number.key for number in base.free}
     new = [index for index, number in enumerate(fit.free) if number.key not in known]
     numbers = [fit.free[index] for index in new]
     made = fit.path.differentiate(fit.state, fit.residual, numbers, both_sides=exact)
-    if base is None:
+    if len(new) == len(fit.free):
         return replace(fit, columns=made)
-    old = [index for index, number in enumerate(fit.free) if number.key in known]
     columns = make_columns(fit.residual.shape[0], len(fit.free))
+    columns[:] = fit.columns
     columns[:, :, new] = made
-    columns[:, :, old] = base.columns[:, :, [known[fit.free[index].key] for index in old]]
     return replace(fit, columns=columns)
 
 
@@ -300,7 +299,7 @@ def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
         acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
         start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
     free, residual = path.list_free(start), path.find_residuals(start)
-    fit = _differentiate(PathFit(path, start, free, residual, base.columns, base.noise), base)
+    fit = _differentiate(PathFit(path, start, free, residual, make_columns(0, 0), base.noise))
     fit = _walk_grids(_descend(fit, base=base)) if free else fit
     return replace(fit, noise=path.learn(fit.residual, noise))
 
@@ -325,7 +324,7 @@ def _descend(
         fit: where to begin.
         exact: see `fit_path`.
         base: the smaller model of an extension that is only approached, in some steps by the noise as it is.
-            Derivatives by its numbers stay as they are there, and the others are those before the last step.
+            Derivatives by its numbers are those of the start, and the others those before the last step.
         target: see `fit_path`.
     """
     path, free, enough = fit.path, fit.free, _SETTLED if exact else _ENOUGH
