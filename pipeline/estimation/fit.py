@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import FOLDS
-from pipeline.estimation.model_state import combine_columns, flatten, make_columns, pick_columns
+from pipeline.estimation.model_state import combine_columns, flatten, pick_columns
 from pipeline.estimation.noise import find_weights, huber_cost
 
 if TYPE_CHECKING:
@@ -254,23 +254,10 @@ def _begin(
     exact: bool = False,
 ) -> PathFit:
     """A fit before its first step; see `fit_path`."""
-    free, residual = path.list_free(start, per_run), path.find_residuals(start)
-    noise = path.learn(residual, noise, exact=exact)
-    return _differentiate(PathFit(path, start, free, residual, make_columns(0, 0), noise), exact=exact)
-
-
-def _differentiate(fit: PathFit, base: PathFit | None = None, *, exact: bool = False) -> PathFit:
-    """The fit with its derivatives anew; those by the numbers of a smaller model stay as they are."""
-    known = set() if base is None else {number.key for number in base.free}
-    new = [index for index, number in enumerate(fit.free) if number.key not in known]
-    numbers = [fit.free[index] for index in new]
-    made = fit.path.differentiate(fit.state, fit.residual, numbers, both_sides=exact)
-    if len(new) == len(fit.free):
-        return replace(fit, columns=made)
-    columns = make_columns(fit.residual.shape[0], len(fit.free))
-    columns[:] = fit.columns
-    columns[:, :, new] = made
-    return replace(fit, columns=columns)
+    free = path.list_free(start, per_run)
+    residual = path.find_residuals(start)
+    columns = path.differentiate(start, residual, free, both_sides=exact)
+    return PathFit(path, start, free, residual, columns, path.learn(residual, noise, exact=exact))
 
 
 def _walk_grids(fit: PathFit, *, exact: bool = False) -> PathFit:
@@ -299,8 +286,9 @@ def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
         acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
         start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
     free, residual = path.list_free(start), path.find_residuals(start)
-    fit = _differentiate(PathFit(path, start, free, residual, make_columns(0, 0), base.noise))
-    fit = _walk_grids(_descend(fit, base=base)) if free else fit
+    fit = PathFit(path, start, free, residual, path.differentiate(start, residual, free), base.noise)
+    steps = max(_FEW_STEPS, len(free) - len(base.free))
+    fit = _walk_grids(_descend(fit, rough=steps)) if free else fit
     return replace(fit, noise=path.learn(fit.residual, noise))
 
 
@@ -312,9 +300,7 @@ def measure_cost(
     return float((path.weight * huber_cost(innovations)).sum()) + path.prior.cost(state, free)
 
 
-def _descend(
-    fit: PathFit, *, exact: bool = False, base: PathFit | None = None, target: float = math.inf
-) -> PathFit:
+def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float = math.inf) -> PathFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
     Derivatives are computed anew after a step that was news, and where steps without become hardly smaller:
@@ -323,12 +309,12 @@ def _descend(
     Args:
         fit: where to begin.
         exact: see `fit_path`.
-        base: the smaller model of an extension that is only approached, in some steps by the noise as it is.
-            Derivatives by its numbers are those of the start, and the others those before the last step.
+        rough: most steps of a rough descent, by the noise as it is; its derivatives are those before the last
+            step. 0 for a whole one.
         target: see `fit_path`.
     """
     path, free, enough = fit.path, fit.free, _SETTLED if exact else _ENOUGH
-    most = _MOST_STEPS if base is None else max(_FEW_STEPS, len(free) - len(base.free))
+    most = rough or _MOST_STEPS
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     unlearned = math.sqrt(4.0 * _ENOUGH * path.spans.size)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
@@ -358,12 +344,12 @@ def _descend(
             continue
         elif (is_fresh or (expected_fall < enough and not exact)) and fallen <= most_fallen:
             break
-        if fallen > most_fallen and base is None:
+        if fallen > most_fallen and not rough:
             fit = replace(fit, noise=path.learn(fit.residual, fit.noise, exact=exact))
             cost, fallen = measure_cost(path, fit.noise, fit.state, free, fit.residual), 0.0
             most_cost = target - fit.noise.log_variance(path.steps, path.weight)
-        if (fall > 0.0 or not is_fresh) and (base is None or count < most):
-            fit = _differentiate(fit, base, exact=exact)
+        if (fall > 0.0 or not is_fresh) and count != rough:
+            fit = replace(fit, columns=path.differentiate(fit.state, fit.residual, free, both_sides=exact))
         is_fresh, before = True, math.inf
     return fit
 
@@ -417,7 +403,10 @@ def _walk_grid(fit: PathFit, number: Free, *, exact: bool) -> PathFit:
         return fit
     state = fit.state.set(number, best)
     residual = path.find_residuals(state)
-    beyond = _descend(_differentiate(replace(fit, state=state, residual=residual)), exact=exact)
+    moved = replace(
+        fit, state=state, residual=residual, columns=path.differentiate(state, residual, fit.free)
+    )
+    beyond = _descend(moved, exact=exact)
     return beyond if beyond.score < fit.score else fit
 
 
