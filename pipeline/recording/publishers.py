@@ -3,6 +3,8 @@
 Which of them a drive obeys depends on when it reads, so that nothing is concluded from what they ask for.
 """
 
+from typing import Literal
+
 import numpy as np
 
 from pipeline.core import Floats, format_share
@@ -54,39 +56,31 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
         "messages there are zero): which of them the drive obeys depends on when it reads; let one send at a "
         "time (twist_mux does)"
     )
-    if np.mean(inside[live]) < _MOST:
+    is_rest_used = bool(np.mean(inside[live]) < _MOST)
+    is_replaced = not is_rest_used and wheels is not None and wheels.is_sure
+    if is_rest_used:
         ignore = [
             OutageSection(start_s=float(np.floor(1e2 * start) / 1e2), end_s=float(np.ceil(1e2 * end) / 1e2))
             for start, end in ends
         ]
         case.changes.setdefault("command", {})["ignore"] = ignore
         text += f": left out, as ignore = {write_spans(ignore)} under [command] in run.toml does"
-        case.findings.append(
-            Finding(
-                "command_mixed",
-                "warning",
-                f"{text}; ignore = [] takes them",
-                where="command",
-                value=zeros,
-                count=len(spans),
-            )
-        )
+        text += "; ignore = [] takes them"
+    elif is_replaced:
+        text += f": {command.source} is not used, and the run is analyzed from its wheels"
+    is_usable = is_rest_used or is_replaced
+    name = "command_mixed" if is_usable else "commands_mixed"
+    severity: Literal["warning", "error"] = "warning" if is_usable else "error"
+    case.findings.append(Finding(name, severity, text, where="command", value=zeros, count=len(spans)))
+    if is_replaced:
+        case.leave_out(command.source)
+        return None
+    if is_rest_used:
         read = case.read(command.source, is_measured=False, section=case.complete().command)
         if read is not None and reading.explained is not None:
             read.explain(reading.explained.motion)
             command.reading = read
-        return command
-    if wheels is None or not wheels.is_sure:
-        case.findings.append(
-            Finding("commands_mixed", "error", text, where="command", value=zeros, count=len(spans))
-        )
-        return command
-    text += f": {command.source} is not used, and the run is analyzed from its wheels"
-    case.findings.append(
-        Finding("command_mixed", "warning", text, where="command", value=zeros, count=len(spans))
-    )
-    case.leave_out(command.source)
-    return None
+    return command
 
 
 def _read_commands(reading: Reading) -> tuple[Floats, Floats]:

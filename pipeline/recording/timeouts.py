@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import CONFIDENCE, Floats, Ints, fit_robustly, robust_spread, student_quantile
+from pipeline.core import CONFIDENCE, NORMAL_95, Floats, Ints, fit_robustly, robust_spread, student_quantile
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare
@@ -154,7 +154,7 @@ _FEWEST_WAITS = 10
 """Least number of waits between live commands, each of which ends a motion that is known from its start."""
 _WAITING = 0.2
 """Least share of the time that is such waits: otherwise the ordinary stops decide."""
-_NATS = 1.92
+_NATS = 0.5 * NORMAL_95**2
 """Loss of log-likelihood at the ends of a 95 % interval of one number."""
 
 

@@ -18,8 +18,6 @@ _LEAST_RAD = np.radians(3.0)
 level floor, starts and stops feign a degree or two."""
 _UNIT = 0.1
 """Deviation of an orientation's length from one: a sensor without one gives zeros."""
-_G = 9.81
-"""Gravity [m/s^2]."""
 _UPRIGHT = 0.9
 """Share of the specific force that is upward where an orientation belongs to it: the rest is acceleration."""
 _WINDOW_S = 1.0
@@ -110,7 +108,9 @@ def _lean_by_attitude(
         roll, pitch, _ = rigid.euler_from_quaternions(attitude)
         level = rigid.rotate(rigid.quaternions_from_euler(roll, pitch, np.zeros(roll.size)), force)
         felt = _smooth(at[inside], (level[:, 0] + 1j * level[:, 1])[inside])
-        angle = _find_angle(felt, body)
+        # A turned sensor feels what the body does, turned back.
+        turned = float(np.angle(np.vdot(felt, body)))
+        angle = turned if _share(felt, body) > _FOLLOWS and abs(turned) > _TURNED_RAD else 0.0
         turn = rigid.quaternions_from_yaw(np.array([-angle]))[0]
     return np.array(rigid.euler_from_quaternions(rigid.multiply_quaternions(attitude, turn[None]))[:2]), angle
 
@@ -122,12 +122,13 @@ def _lean_by_force(
 
     None where they are not those of gravity, or where nothing shows how their sensor is mounted.
     """
-    if at.size < reading.FEWEST_MESSAGES or abs(np.median(np.linalg.norm(force, axis=1)) / _G - 1.0) > _UNIT:
+    size = np.median(np.linalg.norm(force, axis=1)) if at.size >= reading.FEWEST_MESSAGES else 0.0
+    if abs(size / rigid.GRAVITY_MPS2 - 1.0) > _UNIT:
         return None
     if turn is not None:
         force = rigid.rotate(np.broadcast_to(rigid.invert_quaternions(turn[None]), (at.size, 4)), force)
     means = np.column_stack([_average(at, part) for part in force.T])
-    if means[:, 2].mean() < _UPRIGHT * _G:
+    if means[:, 2].mean() < _UPRIGHT * rigid.GRAVITY_MPS2:
         return None
     level = means[:, 0] + 1j * means[:, 1]
     angle = 0.0
@@ -157,13 +158,6 @@ def _measure_gain(felt: Complex, body: Complex) -> tuple[complex, float]:
     others = (both.sum() - both) / np.maximum((own.sum() - own).real, 1e-12)
     spread = float(np.mean(np.abs(others - others.mean()) ** 2))
     return complex(both.sum() / own.sum().real), float(np.sqrt((_PARTS - 1.0) * spread))
-
-
-def _find_angle(felt: Complex, body: Complex) -> float:
-    """Angle from ahead to a sensor's x axis by what it feels of a body's acceleration; zero if not clear."""
-    # A turned sensor feels what the body does, turned back.
-    turned = float(np.angle(np.vdot(felt, body)))
-    return turned if _share(felt, body) > _FOLLOWS and abs(turned) > _TURNED_RAD else 0.0
 
 
 def _is_of_force(attitude: Floats, force: Floats) -> bool:
