@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pipeline.estimation.fit import invert, whiten_columns
+from pipeline.estimation.fit import RIDGE, invert, whiten_columns
 from pipeline.estimation.model_state import stack_columns
 from pipeline.models import Effect, Parameter, Search
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.core import Floats
+    from pipeline.core import Flags, Floats
     from pipeline.estimation.fit import PathFit
     from pipeline.estimation.model_state import ModelState
     from pipeline.models import Largest
@@ -157,13 +157,22 @@ class Extension:
         """Expected gain less the price of its numbers."""
         return self.gain - PRICE * sum(trial.numbers for trial in self.trials)
 
-    def add_to(self, state: ModelState) -> ModelState:
-        """The state with the effects at their expected values."""
+    def _steps(self) -> Iterator[tuple[Trial, tuple[float, ...]]]:
         begin = 0
         for trial in self.trials:
             end = begin + trial.columns.shape[2]
-            state = trial.add_to(state, self.step[begin:end])
+            yield trial, self.step[begin:end]
             begin = end
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether each of the effects is, see `Trial.is_possible`."""
+        return all(trial.is_possible(step) for trial, step in self._steps())
+
+    def add_to(self, state: ModelState) -> ModelState:
+        """The state with the effects at their expected values."""
+        for trial, step in self._steps():
+            state = trial.add_to(state, step)
         return state
 
 
@@ -187,7 +196,7 @@ class Screen:
         self.trials = tuple(filter(None, (_leave_out_silent(fit, trial) for trial in trials)))
         columns = [fit.columns, *(trial.columns for trial in self.trials)]
         ends = np.cumsum([column.shape[2] for column in columns]).tolist()
-        self._places = [range(begin, end) for begin, end in pairwise(ends)]
+        self._places = [np.arange(begin, end) for begin, end in pairwise(ends)]
         self._own = ends[0]
         self._columns = np.concatenate(columns, axis=2)
 
@@ -221,12 +230,25 @@ class Screen:
         return [position for _, places in best.values() for position in places]
 
     @cached_property
-    def _projected(self) -> tuple[Floats, Floats, Floats, float]:
-        """Normal matrix and pull of the candidates beside the model, their sizes alone, and the variance."""
+    def _projected(self) -> tuple[Floats, Floats, Floats, Flags]:
+        """Normal matrix and pull of the candidates' columns of unit size beside the model.
+
+        Returns:
+            Both, by the standard deviation of the innovations, the columns' sizes, and whether the model
+            leaves enough of each.
+        """
         fit = self.saturated
         normal, pull, alone = _project(fit, self._columns, self._own)
-        variance = float(np.mean(fit.white.residual**2))
-        return normal, pull, alone, max(variance, 1e-6)
+        left = np.diag(normal)
+        size = np.sqrt(np.maximum(left, 1e-24))
+        deviation = math.sqrt(max(float(np.mean(fit.white.residual**2)), 1e-6))
+        scaled = normal / np.outer(size, size) + RIDGE * np.eye(size.size)
+        return scaled, pull / (size * deviation), size / deviation, left >= _INDEPENDENT * alone
+
+    @cached_property
+    def _alone(self) -> list[Extension | None]:
+        """Each trial as an extension, possible or not; None where it is not independent."""
+        return [self._measure((index,)) for index in range(len(self.trials))]
 
     def list_singles(self) -> list[Extension]:
         """The best start of each candidate that is possible, by gain less price."""
@@ -237,53 +259,32 @@ class Screen:
 
     def list_starts(self) -> list[Extension]:
         """Every start of every candidate that is possible, by gain less price."""
-        pairs = zip(self.trials, self._places, strict=True)
-        formed = (self._form((trial,), (places,)) for trial, places in pairs)
-        return sorted((one for one in formed if one is not None), key=lambda one: -one.net)
+        possible = [one for one in self._alone if one is not None and one.is_possible]
+        return sorted(possible, key=lambda one: -one.net)
 
     def list_pairs(self) -> list[Extension]:
         """Pairs that explain more than each of the two alone pays for, by gain less price."""
-        known = {id(trial): places for trial, places in zip(self.trials, self._places, strict=True)}
-        alone = dict[str, Extension]()
-        for trial, places in zip(self.trials, self._places, strict=True):
-            # Beside another effect a value may be possible that is not alone.
-            one = self._measure((trial,), (places,))
-            if one is not None and (trial.effect.id not in alone or one.net > alone[trial.effect.id].net):
-                alone[trial.effect.id] = one
-        leading = sorted(alone.values(), key=lambda one: -one.net)[:_PAIRED]
-        pairs = []
-        for one, other in combinations(leading, 2):
-            trials = one.trials + other.trials
-            pair = self._form(trials, tuple(known[id(trial)] for trial in trials))
-            if pair is not None and pair.net > 0.0:
-                pairs.append(pair)
-        return sorted(pairs, key=lambda one: -one.net)
+        # Beside another effect a value may be possible that is not alone.
+        nets = {index: one.net for index, one in enumerate(self._alone) if one is not None}
+        best = {self.trials[index].effect.id: index for index in sorted(nets, key=nets.__getitem__)}
+        leading = sorted(best.values(), key=nets.__getitem__, reverse=True)[:_PAIRED]
+        pairs = (self._measure(pair) for pair in combinations(leading, 2))
+        paying = [pair for pair in pairs if pair is not None and pair.is_possible and pair.net > 0.0]
+        return sorted(paying, key=lambda one: -one.net)
 
-    def _form(self, trials: tuple[Trial, ...], places: tuple[range, ...]) -> Extension | None:
-        """An extension with its expected gain; None where it is not possible or not independent."""
-        extension = self._measure(trials, places)
-        if extension is None:
+    def _measure(self, indices: tuple[int, ...]) -> Extension | None:
+        """Some trials as an extension, possible or not; None where it is not independent."""
+        normal, pull, size, is_left = self._projected
+        at = np.concatenate([self._places[index] for index in indices]) - self._own
+        if not is_left[at].all():
             return None
-        begin = 0
-        for trial, each in zip(trials, places, strict=True):
-            if not trial.is_possible(list(extension.step[begin : begin + len(each)])):
-                return None
-            begin += len(each)
-        return extension
-
-    def _measure(self, trials: tuple[Trial, ...], places: tuple[range, ...]) -> Extension | None:
-        """An extension with its expected gain, possible or not; None where it is not independent."""
-        normal, pull, sizes, variance = self._projected
-        at = np.array([position - self._own for each in places for position in each])
-        inner = normal[np.ix_(at, at)]
-        if np.any(np.diag(inner) < _INDEPENDENT * sizes[at]):
+        inverse = np.linalg.inv(normal[at[:, None], at])
+        # What the other columns leave of each, as a share.
+        if len(indices) > 1 and (1.0 / np.diag(inverse)).min() < _INDEPENDENT:
             return None
-        if len(trials) > 1:
-            size = np.sqrt(np.diag(inner))
-            if np.linalg.eigvalsh(inner / np.outer(size, size))[0] < _INDEPENDENT / 2.0:
-                return None
-        step = invert(inner) @ pull[at]
-        return Extension(trials, tuple(step.tolist()), float(step @ pull[at]) / variance)
+        step = inverse @ pull[at]
+        trials = tuple(self.trials[index] for index in indices)
+        return Extension(trials, tuple((step / size[at]).tolist()), float(step @ pull[at]))
 
 
 def _project(fit: PathFit, columns: Floats, own: int) -> tuple[Floats, Floats, Floats]:

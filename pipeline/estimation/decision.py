@@ -17,7 +17,7 @@ from scipy.special import stdtr
 
 from pipeline.core import NORMAL_95, Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, Screen, list_starts
-from pipeline.estimation.fit import PathFit, approach, fit_path
+from pipeline.estimation.fit import PathFit, approach, approach_each, fit_path
 from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.path_residuals import HORIZONS_S
@@ -493,9 +493,9 @@ class Search:
         return None if judged.refusal else self.prune(fit)
 
     def _approach_all(self, base: PathFit, candidate: Candidate, noise: Noise) -> list[PathFit]:
-        """Some steps of the model with a candidate, from each of its starts."""
+        """Some steps of the model with a candidate, from the better half of its starts."""
         values = list_starts(candidate, self.conditions.largest)
-        return [approach(base, base.state.add(candidate(**one)), noise) for one in values]
+        return approach_each(base, [base.state.add(candidate(**one)) for one in values], noise)
 
     def _try_beside(self, current: PathFit, candidate: Candidate) -> PathFit | None:
         """The model with a companion of its effects, where it is better.

@@ -276,6 +276,18 @@ def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
         start: the extension, at a start of its new numbers.
         noise: what a good model leaves.
     """
+    return _go_on(_begin_extension(base, start), base, noise)
+
+
+def approach_each(base: PathFit, starts: Sequence[ModelState], noise: Noise) -> list[PathFit]:
+    """`approach` from the better half of some starts: those whose first step promises least cost."""
+    begun = [_begin_extension(base, start) for start in starts]
+    begun.sort(key=lambda fit: fit.score - fit.expected_fall)
+    return [_go_on(fit, base, noise) for fit in begun[: (len(begun) + 1) // 2]]
+
+
+def _begin_extension(base: PathFit, start: ModelState) -> PathFit:
+    """An extension at that share of its start where the cost is least, with the noise of the model."""
     path, new = base.path, set(start.ids) - set(base.ids)
     weaker = [start.weaken(new, share) for share in _SHARES]
     if weaker[-1] != weaker[0]:
@@ -286,10 +298,14 @@ def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
         acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
         start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
     free, residual = path.list_free(start), path.find_residuals(start)
-    fit = PathFit(path, start, free, residual, path.differentiate(start, residual, free), base.noise)
-    steps = max(_FEW_STEPS, len(free) - len(base.free))
-    fit = _walk_grids(_descend(fit, rough=steps)) if free else fit
-    return replace(fit, noise=path.learn(fit.residual, noise))
+    return PathFit(path, start, free, residual, path.differentiate(start, residual, free), base.noise)
+
+
+def _go_on(fit: PathFit, base: PathFit, noise: Noise) -> PathFit:
+    """An extension of a model after some steps; see `approach`."""
+    steps = max(_FEW_STEPS, fit.numbers - base.numbers)
+    fit = _walk_grids(_descend(fit, rough=steps)) if fit.free else fit
+    return replace(fit, noise=fit.path.learn(fit.residual, noise))
 
 
 def measure_cost(

@@ -24,7 +24,7 @@ import numpy as np
 from pipeline.core import Newest, compiled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from pipeline.core import Flags, Floats, Ints
 
@@ -98,6 +98,11 @@ class Steps:
     def _gains(self) -> Newest[Floats]:
         return Newest(_GAINS)
 
+    @cached_property
+    def deviations(self) -> Newest[Floats]:
+        """Standard deviations of innovations by the noise in use."""
+        return Newest(_GAINS)
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -116,7 +121,7 @@ class Noise:
     share: Floats
     scale: Floats
 
-    @property
+    @cached_property
     def known(self) -> list[int]:
         """Channels that say anything in one of the runs."""
         return [int(channel) for channel in np.flatnonzero(np.isfinite(self.scale).any(axis=0))]
@@ -139,8 +144,14 @@ class Noise:
         Returns:
             Shape (n, 3, q); zeros in channels that say nothing.
         """
+        gains, deviations = self._follow(steps)
+        return _filter(columns, steps, gains, weights / deviations)
+
+    def _follow(self, steps: Steps) -> tuple[Floats, Floats]:
+        """Gains at each step, shape (n, 4, 3), and standard deviations of the innovations, shape (n, 3)."""
         gains = steps.find_gains(self.step_s, self.correlation, self.share)
-        return _filter(columns, steps, gains, weights / (gains[:, _DEVIATION] * self.scale[steps.run]))
+        key = (self.step_s, self.correlation.tobytes(), self.share.tobytes(), self.scale.tobytes())
+        return gains, steps.deviations.recall(key, lambda: gains[:, _DEVIATION] * self.scale[steps.run])
 
     def log_variance(self, steps: Steps, weights: Floats | float = 1.0) -> float:
         """Sum of the logarithms of the innovations' variances: what a likelihood has beside its squares.
@@ -149,8 +160,7 @@ class Noise:
             steps: the steps.
             weights: of each, shape (n, 1).
         """
-        gains = steps.find_gains(self.step_s, self.correlation, self.share)
-        spreads = gains[:, _DEVIATION] * self.scale[steps.run]
+        _, spreads = self._follow(steps)
         known = np.isfinite(spreads)
         return 2.0 * float((np.broadcast_to(weights, spreads.shape)[known] * np.log(spreads[known])).sum())
 
@@ -229,56 +239,22 @@ def _maximize(
 
     They are squares of sines: a bound is a place like others then, where the likelihood is level.
     """
-    most = math.exp(-step_s / _LONGEST_S)
-    flat, size = np.ascontiguousarray(values[:, 0]), np.empty((values.shape[0], _LANES))
-    costs, rows = np.empty(_LANES), np.empty(_ROWS * _LANES)
-    near = _SAME_SCALE if exact else _NEAR_SCALE
-
-    def read(at: Floats) -> tuple[Floats, Floats]:
-        phi, part = np.ascontiguousarray(np.sin(at.T) ** 2)
-        return np.maximum(most * phi, _LEAST_KEPT), part
-
-    def rate(at: Floats) -> Floats:
-        phi, part = read(at)
-        keeps = np.exp(np.outer(steps.lengths / step_s, np.log(phi)))
-        _rate(flat, steps.fresh, steps.kind, keeps, part, rows, size, costs, near)
-        return costs
-
-    starts, radius = np.array([(1.22, 0.35), (0.79, 1.02)]), 0.3
+    most, count = math.exp(-step_s / _LONGEST_S), values.shape[0]
+    starts, radius = [(1.22, 0.35), (0.79, 1.02)], 0.3
     if known is not None and not exact:
-        starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.06
-    same = _SAME_EXACT if exact else _SAME
-    best = min((_descend(rate, start, radius, same) for start in starts), key=lambda one: one[0])
-    phi, part = read(best[1][None])
-    return float(phi[0]), float(part[0])
-
-
-def _descend(
-    rate: Callable[[Floats], Floats], center: Floats, radius: float, same: float
-) -> tuple[float, Floats]:
-    """Least cost and where, by quadratics through the costs of a point and of seven around it."""
-    least, where = math.inf, np.array(center)
-    for _ in range(_MOST_ROUNDS):
-        at = center + radius * _AROUND
-        costs = rate(at)
-        lowest = int(costs.argmin())
-        is_lower = costs[lowest] < least
-        if is_lower:
-            least, where = float(costs[lowest]), at[lowest]
-        level, *slope, xx, xy, yy = _QUADRATIC @ costs
-        curvature, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-        along = axes.T @ slope
-        # Downhill where it is curved downwards, too: a bound is a top where it is not the best place.
-        away = np.where(curvature > 0.0, np.abs(along) / np.maximum(curvature, 1e-12), _FAR)
-        step = axes @ -np.copysign(np.minimum(away, _FAR), along)
-        terms = _list_terms(np.vstack((step, _AROUND))) @ (level, *slope, xx, xy, yy)
-        missed = float(np.abs(costs - terms[1:]).max())
-        if max(least - float(terms[0]), missed) < same:
-            # Not the best of eight points: which one that is depends on rounding.
-            return least, np.asarray(center + radius * step)
-        center = np.asarray(center + radius * step) if is_lower else where
-        radius *= 1.0 if is_lower and math.hypot(*step) >= 1.0 else _CLOSER
-    return least, where
+        phi, part = (math.asin(math.sqrt(min(one, 1.0))) for one in (known[0] / most, known[1]))
+        starts, radius = [(phi, part)], 0.06
+    places = []
+    for start in starts:
+        places.append(np.array([*start, math.inf]))
+        _descend(
+            np.ascontiguousarray(values[:, 0]), steps.fresh, steps.kind, steps.lengths / step_s, most, radius,
+            _SAME_EXACT if exact else _SAME, _SAME_SCALE if exact else _NEAR_SCALE, places[-1],
+            np.empty((steps.lengths.size, _LANES)), np.empty(_LANES), np.empty(_ROWS * _LANES),
+            np.empty((count, _LANES)), np.empty(_LANES), np.empty(_TERMS),
+        )  # fmt: skip
+    phi, part, _ = min(places, key=lambda place: float(place[2])).tolist()
+    return _read(phi, most), math.sin(part) ** 2
 
 
 def _list_terms(at: Floats) -> Floats:
@@ -294,6 +270,120 @@ _AROUND: Floats = np.array(
 )
 _QUADRATIC: Floats = np.asarray(np.linalg.pinv(_list_terms(_AROUND)), dtype=np.float64)
 """Terms of the quadratic through the costs of these points, shape (6, 8)."""
+_TERMS = 6
+
+
+@compiled()
+def _read(angle: float, most: float) -> float:
+    """Correlation of an angle."""
+    return max(most * math.sin(angle) ** 2, _LEAST_KEPT)
+
+
+@compiled()
+def _value(terms: Floats, x: float, y: float) -> float:
+    """Quadratic of some terms at a place."""
+    linear = terms[0] + terms[1] * x + terms[2] * y
+    return linear + 0.5 * terms[3] * x * x + terms[4] * x * y + 0.5 * terms[5] * y * y
+
+
+@compiled()
+def _find_way(slope: float, curvature: float) -> float:
+    """Step along an axis of a quadratic, at most `_FAR`.
+
+    Downhill where it is curved downwards, too: a bound is a top where it is not the best place.
+    """
+    away = min(abs(slope) / max(curvature, 1e-12), _FAR) if curvature > 0.0 else _FAR
+    return -math.copysign(away, slope)
+
+
+@compiled()
+def _find_step(terms: Floats) -> tuple[float, float]:
+    """Step towards the least value of a quadratic, along each of its axes."""
+    mean, half = 0.5 * (terms[3] + terms[5]), 0.5 * (terms[3] - terms[5])
+    apart, angle = math.hypot(half, terms[4]), 0.5 * math.atan2(terms[4], half)
+    x, y = math.cos(angle), math.sin(angle)
+    one = _find_way(x * terms[1] + y * terms[2], mean + apart)
+    other = _find_way(x * terms[2] - y * terms[1], mean - apart)
+    return x * one - y * other, y * one + x * other
+
+
+@compiled()
+def _look_around(
+    x: float, y: float, radius: float, most: float, lengths: Floats, keeps: Floats, shares: Floats
+) -> None:
+    """What `_rate` needs of a place and of those around it."""
+    for k in range(shares.size):
+        decay = math.log(_read(x + radius * _AROUND[k, 0], most))
+        shares[k] = math.sin(y + radius * _AROUND[k, 1]) ** 2
+        for length in range(lengths.size):
+            keeps[length, k] = math.exp(lengths[length] * decay)
+
+
+@compiled(
+    "void(float64[::1], boolean[::1], int64[::1], float64[::1], float64, float64, float64, float64, "
+    "float64[::1], float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[::1])"
+)
+def _descend(
+    values: Floats,
+    fresh: Flags,
+    kind: Ints,
+    lengths: Floats,
+    most: float,
+    radius: float,
+    same: float,
+    near: float,
+    place: Floats,
+    keeps: Floats,
+    shares: Floats,
+    rows: Floats,
+    size: Floats,
+    costs: Floats,
+    terms: Floats,
+) -> None:
+    """Least cost and where, by quadratics through the costs of a point and of seven around it.
+
+    Args:
+        values: increments, shape (n,).
+        fresh: steps that do not continue the one before, shape (n,).
+        kind: of the length of each step, shape (n,).
+        lengths: of each kind, in those that the correlation refers to, shape (kinds,).
+        most: largest correlation.
+        radius: of the points around.
+        same: difference of costs at which it has converged.
+        near: see `_find_scales`.
+        place: angles of correlation and share where it begins; where it ends, and the least cost, shape (3,).
+        keeps: room, shape (kinds, lanes), as are the following for `_rate`, and (6,) for the terms.
+        shares: room.
+        rows: room.
+        size: room.
+        costs: room.
+        terms: room.
+    """
+    x, y, least = place[0], place[1], math.inf
+    for _ in range(_MOST_ROUNDS):
+        _look_around(x, y, radius, most, lengths, keeps, shares)
+        _rate(values, fresh, kind, keeps, shares, rows, size, costs, near)
+        lowest = costs.argmin()
+        is_lower = costs[lowest] < least
+        if is_lower:
+            least = costs[lowest]
+            place[0], place[1] = x + radius * _AROUND[lowest, 0], y + radius * _AROUND[lowest, 1]
+        for term in range(_TERMS):
+            terms[term] = 0.0
+            for k in range(_LANES):
+                terms[term] += _QUADRATIC[term, k] * costs[k]
+        step_x, step_y = _find_step(terms)
+        missed = least - _value(terms, step_x, step_y)
+        for k in range(_LANES):
+            missed = max(missed, abs(costs[k] - _value(terms, _AROUND[k, 0], _AROUND[k, 1])))
+        step_x, step_y = radius * step_x, radius * step_y
+        if missed < same:
+            # Not the best of eight points: which one that is depends on rounding.
+            place[0], place[1] = x + step_x, y + step_y
+            break
+        x, y = (x + step_x, y + step_y) if is_lower else (place[0], place[1])
+        radius *= 1.0 if is_lower and math.hypot(step_x, step_y) >= radius else _CLOSER
+    place[2] = least
 
 
 def _filter(columns: Floats, steps: Steps, gains: Floats, weights: Floats) -> Floats:

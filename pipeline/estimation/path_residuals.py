@@ -121,8 +121,13 @@ class PathResiduals(ABC):
 
     def _multiply(self, velocities: Floats, run: int) -> Floats:
         """Increments by mean velocities over the steps of a run."""
-        increments: Floats = velocities * self.spans[self.run == run][:, None]
+        increments: Floats = velocities * self._spans_by_run[run]
         return increments
+
+    @cached_property
+    def _spans_by_run(self) -> list[Floats]:
+        ends = np.cumsum(np.bincount(self.run, minlength=len(self.residuals_by_run)))
+        return np.split(self.spans[:, None], ends[:-1])
 
     def find_residuals(self, state: ModelState, runs: Sequence[int] = ()) -> Floats:
         """Measured less predicted increments of some runs, in order, by default of all, shape (n, 3)."""
