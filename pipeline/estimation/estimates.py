@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
-from pipeline.estimation.fit import PathFit, invert
+from pipeline.estimation.fit import PathFit, find_unlearned, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
 from pipeline.estimation.ladder import ModelAssessment
@@ -208,11 +208,14 @@ def _estimate_added(fit: PathFit, effect: Effect) -> list[Estimate]:
     )
     total = np.zeros(len(grown.free))
     for _ in range(_PASSES):
-        step = invert(grown.normal) @ (grown.white.columns.T @ grown.white.residual)
-        rest = grown.residual - combine_columns(grown.columns, step)
-        # The noise of residuals that still hold an effect would hide it.
-        grown = replace(grown, residual=rest, noise=path.learn(rest, grown.noise))
+        pull = grown.white.columns.T @ grown.white.residual
+        step = invert(grown.normal) @ pull
         total += step
+        grown = replace(grown, residual=grown.residual - combine_columns(grown.columns, step))
+        if float(step @ pull) <= find_unlearned(path):
+            break
+        # The noise of residuals that still hold an effect would hide it.
+        grown = replace(grown, noise=path.learn(grown.residual, grown.noise))
     moved = dict(zip(grown.free, total.tolist(), strict=True))
     made = {item.free: item for item in estimate_path(grown).items}
     if not all(made[number].observable for number in new):

@@ -331,8 +331,7 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
     """
     path, free, enough = fit.path, fit.free, _SETTLED if exact else _ENOUGH
     most = rough or _MOST_STEPS
-    # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
-    unlearned = math.sqrt(4.0 * _ENOUGH * path.spans.size)
+    unlearned = find_unlearned(path)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
     cost = measure_cost(path, fit.noise, fit.state, free, fit.residual)
     most_cost = target - fit.noise.log_variance(path.steps, path.weight)
@@ -368,6 +367,14 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
             fit = replace(fit, columns=path.differentiate(fit.state, fit.residual, free, both_sides=exact))
         is_fresh, before = True, math.inf
     return fit
+
+
+def find_unlearned(path: PathResiduals) -> float:
+    """Fall of chi-square after which the noise need not be learned anew.
+
+    After a fall f, that would change near f^2 / 4n of the likelihood of n steps.
+    """
+    return math.sqrt(4.0 * _ENOUGH * path.spans.size)
 
 
 def _solve(fit: PathFit, damping: float) -> tuple[list[Free], list[float], float]:
