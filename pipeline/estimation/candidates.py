@@ -17,7 +17,7 @@ from pipeline.models import Effect, Parameter, Search
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.core import Flags, Floats
+    from pipeline.core import Flags, Floats, Ints
     from pipeline.estimation.fit import PathFit
     from pipeline.estimation.model_state import ModelState
     from pipeline.models import Largest
@@ -220,7 +220,7 @@ class Screen:
     def _list_best_columns(self, fit: PathFit) -> list[int]:
         """Columns of the best start of each candidate."""
         normal, pull, _ = _project(fit, self._columns, self._own)
-        best: dict[str, tuple[float, range]] = {}
+        best: dict[str, tuple[float, Ints]] = {}
         for trial, places in zip(self.trials, self._places, strict=True):
             at = np.array(places) - self._own
             step = invert(normal[np.ix_(at, at)]) @ pull[at]

@@ -181,28 +181,23 @@ class EstimationData:
         if self.is_drive_alone:
             return self.list_drivetrain()
         hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
-        return tuple(
-            cast("Candidate", effect)
-            for effect in list_effects()
-            if self.vehicle.kind in effect.kinds
-            and effect.place not in hidden
-            and not effect.parts
-            and self._can_show(effect())
-        )
+        able = self._list_able()
+        return tuple(cast("Candidate", one) for one in able if one.place not in hidden and not one.parts)
+
+    def list_drivetrain(self) -> tuple[Candidate, ...]:
+        """Effects between command and wheels."""
+        return tuple(cast("Candidate", one) for one in self._list_able() if one.place in _DRIVETRAIN)
+
+    def _list_able(self) -> list[type[Effect]]:
+        """Effects of this kind of vehicle that its sensors and its driving may show."""
+        of_kind = (effect for effect in list_effects() if self.vehicle.kind in effect.kinds)
+        return [effect for effect in of_kind if self._can_show(effect())]
 
     def _can_show(self, effect: Effect) -> bool:
         if len(self.runs) > 1 and is_of_one_run(effect.parameters):
             return False
         is_long = max(run.duration_s for run in self.runs) >= _LONG_S
         return effect.can_show(self.conditions) and (is_long or Excitation.LONG not in effect.needs)
-
-    def list_drivetrain(self) -> tuple[Candidate, ...]:
-        """Effects between command and wheels."""
-        return tuple(
-            cast("Candidate", effect)
-            for effect in list_effects()
-            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN and self._can_show(effect())
-        )
 
     @cached_property
     def behind_wheels(self) -> EstimationData:

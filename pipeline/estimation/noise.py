@@ -283,7 +283,7 @@ def _read(angle: float, most: float) -> float:
 def _value(terms: Floats, x: float, y: float) -> float:
     """Quadratic of some terms at a place."""
     linear = terms[0] + terms[1] * x + terms[2] * y
-    return linear + 0.5 * terms[3] * x * x + terms[4] * x * y + 0.5 * terms[5] * y * y
+    return float(linear + 0.5 * terms[3] * x * x + terms[4] * x * y + 0.5 * terms[5] * y * y)
 
 
 @compiled()
