@@ -68,7 +68,7 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
     layout: str, effects: dict[str, float], tmp_path: Path
 ) -> None:
     diagnosis, runs, vehicle = _diagnose(layout, effects, tmp_path)
-    screen = describe(diagnosis.runs)
+    screen = describe(diagnosis.runs, everything=True)
     for run, late in zip(diagnosis.runs, _CLOCKS, strict=True):
         told = json.loads(json.dumps(diagnosis_as_json(run)))
         named = {effect["id"]: effect["parameters"] for effect in told["effects"]}
