@@ -422,8 +422,7 @@ def _tabulate_pair_ratios(pairs: Sequence[PairLine], caption: str) -> Table:
         ]
         for pair in pairs
     ]
-    columns = [i for i in range(len(_RATIOS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
-    return Table(caption, [_RATIOS[i] for i in columns], [[row[i] for i in columns] for row in rows])
+    return Table(caption, _RATIOS, rows).drop_empty()
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
@@ -442,10 +441,7 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
     ]
     caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; every run has the same weight"
     # Columns without any value, not computed or not in the logs, are omitted.
-    columns = [
-        i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)
-    ]
-    return Table(caption, [_DATASETS[i] for i in columns], [[row[i] for i in columns] for row in rows])
+    return Table(caption, _DATASETS, rows).drop_empty()
 
 
 def _tabulate_pairs(view: View) -> Table | None:

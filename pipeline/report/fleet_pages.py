@@ -126,9 +126,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
 
 
 def _tabulate_levels(caption: str, parameters: Sequence[Mapping[str, object]]) -> Table:
-    rows = [_list(row) for row in parameters]
-    columns = [i for i in range(len(_LEVELS)) if any(row[i] for row in rows)]
-    return Table(caption, [_LEVELS[i] for i in columns], [[row[i] for i in columns] for row in rows])
+    return Table(caption, _LEVELS, [_list(row) for row in parameters]).drop_empty()
 
 
 def _label(row: Mapping[str, object]) -> str:
