@@ -413,9 +413,8 @@ def find_causes(store: Store, question: Question) -> Causes:
         raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
     untested = find_untested(compared, question)
     budgets, differences = compare_causes(own, untested=untested)
-    keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
     notes = (*compared.notes, *note_untested(untested))
-    return Causes(budgets, differences, source, find_level_names(store), keys, notes)
+    return Causes(budgets, differences, source, find_level_names(store), compared.keys, notes)
 
 
 def summarize_causes(causes: Causes) -> dict[str, object]:

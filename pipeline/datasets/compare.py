@@ -184,7 +184,10 @@ class _Material:
         for name in inputs:
             levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
             groups = _group_levels(levels)
-            overlaps = _find_overlaps(groups, driven[name])
+            overlaps = {
+                frozenset((a.name, b.name)): find_overlap(driven[name][a.name].bins, a.names, b.names)
+                for a, b in itertools.combinations(groups, 2)
+            }
             tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps, driven[name])
             at_equal.append(self._level_datasets(groups, name, driven[name]))
         datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
@@ -325,13 +328,6 @@ def _group_levels(levels: pl.DataFrame) -> list[Group]:
         Group(str(name), rows[EQUAL_DRIVING].to_numpy(), names=tuple(rows["run"]))
         for (name,), rows in parts.items()
     ]
-
-
-def _find_overlaps(groups: Sequence[Group], driven: Mapping[str, Levelled]) -> dict[frozenset[str], Overlap]:
-    return {
-        frozenset((a.name, b.name)): find_overlap(driven[a.name].bins, a.names, b.names)
-        for a, b in itertools.combinations(groups, 2)
-    }
 
 
 def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[str, frozenset[str]], str]:

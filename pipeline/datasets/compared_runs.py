@@ -57,6 +57,11 @@ class ComparedRuns:
     refusals: Mapping[str, str] = field(default_factory=dict)
     date_notes: tuple[str, ...] = ()
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Run/generation of every run."""
+        return tuple(f"{run}/{manifest.key}" for run, manifest in sorted(self.manifests.items()))
+
     def scan(self, table: str) -> pl.LazyFrame:
         """Rows of a table of these runs."""
         rows = scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
