@@ -279,7 +279,7 @@ def _name_items(
     open_items: Sequence[Item], items: Sequence[Item], manifests: Mapping[str, Manifest], store: Store
 ) -> list[Item]:
     identities = LogIdentities(store)
-    logs = _list_logs(manifests)
+    logs = {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
     runs = {_path_of(log): run for run, log in logs.items()}
     runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
     new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
@@ -315,10 +315,6 @@ def _know_run(
         size=size if isinstance(size, int) else None,
         is_present=content is not None and content == log.get("sha256"),
     )
-
-
-def _list_logs(manifests: Mapping[str, Manifest]) -> dict[str, Mapping[str, object]]:
-    return {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
 
 
 def _path_of(log: Mapping[str, object]) -> str:
@@ -455,17 +451,13 @@ def prune_results(store: Store, pruning: Pruning) -> Pruned:
         keep -= 1
         removed += store.prune(keep)
         size, errors = measure_results(store)
-    over = () if size <= pruning.quota_bytes else (_over_quota(store, size, pruning.quota_bytes),)
-    return Pruned(removed=tuple(removed), problems=(*errors, *over))
-
-
-def _over_quota(store: Store, size: int, quota: int) -> BatchError:
-    return BatchError(
-        "over_quota",
-        f"the results hold {size / 1e9:.3g} GB without any old generation, more than {quota / 1e9:.3g} GB",
-        where=str(store.root),
-        hint="Raise --quota, or move runs elsewhere",
-    )
+    problems: list[SlipError] = [*errors]
+    if size > pruning.quota_bytes:
+        held, quota = (f"{one / 1e9:.3g} GB" for one in (size, pruning.quota_bytes))
+        what = f"the results hold {held} without any old generation, more than {quota}"
+        hint = "Raise --quota, or move runs elsewhere"
+        problems.append(BatchError("over_quota", what, where=str(store.root), hint=hint))
+    return Pruned(removed=tuple(removed), problems=tuple(problems))
 
 
 def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:

@@ -22,6 +22,7 @@ from pipeline.cli.conventions import (
     print_lines,
     print_note,
     print_result,
+    print_warnings,
 )
 from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError, format_count
 
@@ -50,8 +51,7 @@ def open_model(path: Path, *, trust_code: bool) -> models.ModelFile:
     """
     trust_named(path, wanted=trust_code)
     file = models.read_model(path)
-    for warning in file.warnings:
-        print_note(f"slip: {warning}")
+    print_warnings(file.warnings)
     return file
 
 
@@ -77,8 +77,7 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
         what = f"{', '.join(unknown)} can only come from Python that is not trusted, and that is not run"
         hint = f"Read it, then trust it: slip model trust {shlex.quote(str(path))}"
         raise MotionError("untrusted_effect", what, where=str(path), hint=hint)
-    for warning in file.warnings:
-        print_note(f"slip: {warning}")
+    print_warnings(file.warnings)
     return file
 
 
@@ -455,8 +454,7 @@ def compare_rivals(
                 *format_contest(contest.contest),
             ]
         )
-        for text in warnings:
-            print_note(f"slip: {text}")
+        print_warnings(warnings)
     return CLEAN
 
 

@@ -17,8 +17,8 @@ from pipeline.cli.conventions import (
     TrustCode,
     print_json,
     print_lines,
-    print_note,
     print_result,
+    print_warnings,
 )
 from pipeline.cli.model_runs import (
     Against,
@@ -242,7 +242,13 @@ def compare(  # noqa: D417 - the shared options document themselves
         seen = "its error there is not a held-out error"
         own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
         held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
-        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
+        carried = carry_over(
+            file.model,
+            runs,
+            chosen.source,
+            fitted_on=[str(run.get("terrain")) for run in file.list_fitted("runs")],
+            per_run=file.per_run,
+        )
         rows += [(str(path), item) for item in carried]
     warnings = [text for text in (chosen.warning, *own_runs, *(item.warning for _, item in rows)) if text]
     if spoken.json:
@@ -260,7 +266,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     elif not spoken.quiet:
         print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
         print_lines([text for one in held for text in describe_coverage(one)])
-        _warn(warnings)
+        print_warnings(warnings)
     return CLEAN
 
 
@@ -294,7 +300,7 @@ def speed(  # noqa: D417 - the shared options document themselves
         "warnings": [*file.warnings, *warnings],
     }
     if not spoken.json:
-        _warn(warnings)
+        print_warnings(warnings)
     lines = [
         f"{INPUT_WORDS[chosen.source.value]} of {', '.join(run.name for run in runs)} ({chosen.reason})",
         *words.format_speed_limits(limits, tolerance_m, ahead_s),
@@ -406,7 +412,7 @@ def _change(
         if carried:
             lines += ["", *_format_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
-        _warn(warnings)
+        print_warnings(warnings)
     return CLEAN
 
 
@@ -426,10 +432,6 @@ def _gather(
     quiet = spoken.quiet or spoken.json
     vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.results, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs
-
-
-def _terrains(file: models.ModelFile) -> list[str]:
-    return [str(run.get("terrain")) for run in file.list_fitted("runs")]
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
@@ -487,8 +489,3 @@ def _list_effects(ids: Sequence[str]) -> str:
 def _list_idle(model: models.Model) -> list[str]:
     """Effects that do not act, since the model lacks what they act beside."""
     return [f"  ! {effect.id} {why}" for effect in model if (why := models.explain_idle(effect, model.ids))]
-
-
-def _warn(warnings: Sequence[str]) -> None:
-    for text in warnings:
-        print_note(f"slip: {text}")

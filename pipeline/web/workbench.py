@@ -289,9 +289,11 @@ class Sessions:
         def make() -> Effect:
             return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)
 
+        named = {effect.id for effect in editor.diagnosed}
         changes: dict[str, Callable[[], Session]] = {
             "open": lambda: session,
-            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway or self._is_named(editor, ask)),
+            # The diagnosis tested its effects together with all others.
+            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway or ask.effect in named),
             "add_named": lambda: self._add_named(editor, ask),
             "add_found": lambda: self._add_suggestion(editor, ask),
             "formula": lambda: editor.add_effect(make(), anyway=ask.anyway),
@@ -311,10 +313,6 @@ class Sessions:
         diagnosis = read_diagnosis(self.results, prepared.manifest)
         formula = () if diagnosis is None else read_suggestion(diagnosis, prepared.vehicle)
         return Editor(file, prepared, session, (*_list_named(diagnosis), *formula))
-
-    def _is_named(self, editor: Editor, ask: Ask) -> bool:
-        """Whether the diagnosis tested an effect together with all others."""
-        return ask.effect in {effect.id for effect in editor.diagnosed}
 
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
         diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
