@@ -57,9 +57,9 @@ if TYPE_CHECKING:
     from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory, read_memory
     from pipeline.core.processes import (
         PACKAGE,
-        THREAD_VARIABLES,
         end_with,
         keep_current_folder_out,
+        prepare_workers,
         python_command,
         read_version,
         require_package,

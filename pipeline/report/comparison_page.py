@@ -7,7 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration
+from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration, number_in
 from pipeline.datasets import (
     ABOUT_BLOCKS,
     ABOUT_UNIT,
@@ -41,7 +41,6 @@ from pipeline.report import (
     write_page,
 )
 from pipeline.report.page import add_figures, render_figures
-from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis, stack
 from pipeline.store import Store
 from pipeline.words import Line, PairLine, list_pairs, list_shown_notes, title_line
@@ -474,7 +473,8 @@ def _format_p(p: float | None) -> str:
 
 
 def _format_ends(row: Mapping[str, object]) -> str:
-    return format_ends(row).replace(" ", "\u00a0") or MISSING
+    low, high = number_in(row, "low"), number_in(row, "high")
+    return MISSING if low is None else f"{format_number(low)}\u00a0to\u00a0{format_number(high)}"
 
 
 def tabulate_difficulty(shown: pl.DataFrame) -> Table:
