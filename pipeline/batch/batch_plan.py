@@ -1,7 +1,7 @@
 """Before and after a batch: which logs are done and what their runs are called; pages and pruning."""
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -14,7 +14,7 @@ from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
-from pipeline.core import SlipError, read_bounded, read_version, walk_files
+from pipeline.core import SlipError, group_by, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets, read_tables
@@ -133,11 +133,11 @@ def list_doubtful(sizes: Mapping[Path, int], known: Sequence[KnownRun]) -> tuple
     """
     taken_sizes = {run.size for run in known}
     taken_names = {run.run for run in known}
-    by_size = _group(sizes, lambda path: sizes[path])
-    by_name = _group(sizes, name_plainly)
+    by_size = group_by((sizes[path], path) for path in sorted(sizes)).values()
+    by_name = group_by((name_plainly(path), path) for path in sorted(sizes))
     alike = {path for group in by_size if len(group) > 1 for path in group}
     alike |= {path for path, size in sizes.items() if size in taken_sizes or None in taken_sizes}
-    crowded = {path for group in by_name for path in group[name_plainly(group[0]) not in taken_names :]}
+    crowded = {path for name, group in by_name.items() for path in group[name not in taken_names :]}
     return tuple(sorted(alike | crowded))
 
 
@@ -174,13 +174,6 @@ def assign_names(new: Collection[Path], hashes: Mapping[Path, str], known: Seque
         taken.add(runs[path])
     copies |= {path: runs[first[hashes[path]]] for path in again}
     return Names(runs=runs, copies=copies)
-
-
-def _group(paths: Iterable[Path], label: Callable[[Path], object]) -> list[Sequence[Path]]:
-    groups: dict[object, list[Path]] = {}
-    for path in sorted(paths):
-        groups.setdefault(label(path), []).append(path)
-    return list(groups.values())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,6 +40,7 @@ from pipeline.core import (
     format_digits,
     format_interval,
     format_length,
+    group_by,
     suffix_unit,
 )
 
@@ -265,9 +266,8 @@ def _format_fleet(content: Mapping[str, object], *, everything: bool) -> list[st
         lines += [_format_number(row, width, everything=everything) for row in shown] or [
             "  no significant effect in any of them"
         ]
-        reasons: dict[str, list[str]] = {}
-        for row in own if everything else ():
-            reasons.setdefault(str(row["because"]), []).append(f"{row['effect']}.{row['parameter']}")
+        unsettled = own if everything else ()
+        reasons = group_by((row["because"], f"{row['effect']}.{row['parameter']}") for row in unsettled)
         lines += [f"  {', '.join(labels)}: {because}" for because, labels in reasons.items()]
     notes = [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
     if everything:

@@ -110,6 +110,7 @@ if TYPE_CHECKING:
         format_share,
         format_size,
         format_two,
+        group_by,
         guess_names,
         make_plain,
         mark_finding,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, format_count
+from pipeline.core import FEWEST_OF_SPREAD, format_count, group_by
 from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
@@ -408,10 +408,7 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str
     """Notes on pairs without an answer, once for those alike, and on what intervals of single runs say."""
     if len(groups) < 2:  # noqa: PLR2004 - a pair
         return ["there is one dataset only: nothing to compare it with"] if groups else []
-    silent: dict[str, list[str]] = {}
-    for pair in pairs:
-        if pair.p is None:
-            silent.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
+    silent = group_by((pair.note, f"{pair.a.name} and {pair.b.name}") for pair in pairs if pair.p is None)
     sentences = []
     for note, (first, *others) in sorted(silent.items()):
         count_text = f", and {format_count(len(others), 'more pair')}" if others else ""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration, number_in
+from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration, group_by, number_in
 from pipeline.datasets import (
     ABOUT_BLOCKS,
     ABOUT_UNIT,
@@ -43,7 +43,7 @@ from pipeline.report import (
 from pipeline.report.page import add_figures, render_figures
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis, stack
 from pipeline.store import Store
-from pipeline.words import Line, PairLine, list_pairs, list_shown_notes, title_line
+from pipeline.words import PairLine, list_pairs, list_shown_notes, title_line
 from pipeline.words.comparison import list_lines
 
 _ROW_HEIGHT = 34
@@ -352,9 +352,7 @@ def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
 
 def _list_answers(answer: Answer) -> list[dict[str, object]]:
     """The answer's lines under what they are about."""
-    answers: dict[str, list[Line]] = {}
-    for line in list_lines(answer):
-        answers.setdefault(title_line(line), []).append(line)
+    answers = group_by((title_line(line), line) for line in list_lines(answer))
     return [{"title": title, "input": lines[0].input, "lines": lines} for title, lines in answers.items()]
 
 

@@ -15,6 +15,7 @@ from pipeline.core import (
     FigureFormat,
     format_count,
     format_share,
+    group_by,
     mapping_in,
     number_in,
     objects_in,
@@ -89,10 +90,9 @@ def render_fleet(content: Mapping[str, object]) -> str:
     """
     rows = objects_in(content, "parameters")
     runs = mapping_in(content, "runs")
-    reasons: dict[str, list[str]] = {}
-    for row in rows:
-        if row["level"] is None:
-            reasons.setdefault(f"{row['because']} ({row['vehicle']})", []).append(_label(row))
+    reasons = group_by(
+        (f"{row['because']} ({row['vehicle']})", _label(row)) for row in rows if row["level"] is None
+    )
     vehicles = []
     for number, name in enumerate(runs):
         own = [row for row in rows if row["vehicle"] == name]

@@ -11,6 +11,7 @@ from pipeline.core import (
     format_angle,
     format_length,
     format_share,
+    group_by,
     make_plain,
     split_interval,
     suffix_unit,
@@ -342,9 +343,7 @@ def _name_outcome(check: Check, name: str) -> str:
 
 def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
     """Names of the quantities of which no change is shown, a line for each outcome."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(_name_outcome(check, name), []).append(name)
+    groups = group_by((_name_outcome(check, name), name) for name in names)
     outcomes: dict[str, set[str]] = {}
     for name in check.changes:
         outcomes.setdefault(name.partition(".")[0], set()).add(
