@@ -298,8 +298,8 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     growing = [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
     skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]
     why = "not started: see the other errors"
-    left = [Line(path=one.log.path, run=one.run, state="left", reason=why) for one in result.remaining]
-    lines = [*_list_plan(plan), *map(_make_line, result.reports), *left]
+    remaining = [Line(path=one.log.path, run=one.run, state="left", reason=why) for one in result.remaining]
+    lines = [*_list_plan(plan), *map(_make_line, result.reports), *remaining]
     return Outcome(
         lines=tuple(sorted((*lines, *growing, *skipped), key=lambda line: line.path)),
         seconds=time.monotonic() - started,
