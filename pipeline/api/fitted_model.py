@@ -352,12 +352,8 @@ class Model:
         """Its motion on a run, with its values as they are, as rows for figures."""
         data, state = self._prepare(run, input, vehicle_of)
         known = run.manifest.tables
-        places = (
-            run.table("velocities").select("t", "x", "y").sort("t").collect()
-            if "velocities" in known
-            else None
-        )
-        return MotionStage(data, places).view(state, (), None)
+        velocities = run.table("velocities").collect() if "velocities" in known else None
+        return MotionStage(data, velocities).view(state, (), None)
 
     def _prepare(
         self, run: StoredRun, input: Source | None, owner: Owner | None

@@ -1,7 +1,7 @@
 """Before and after a batch: which logs are done and what their runs are called; pages and pruning."""
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -14,7 +14,7 @@ from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
-from pipeline.core import SlipError, read_bounded, read_version, walk_files
+from pipeline.core import SlipError, group_by, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets, read_tables
@@ -133,11 +133,11 @@ def list_doubtful(sizes: Mapping[Path, int], known: Sequence[KnownRun]) -> tuple
     """
     taken_sizes = {run.size for run in known}
     taken_names = {run.run for run in known}
-    by_size = _group(sizes, lambda path: sizes[path])
-    by_name = _group(sizes, name_plainly)
+    by_size = group_by((sizes[path], path) for path in sorted(sizes)).values()
+    by_name = group_by((name_plainly(path), path) for path in sorted(sizes))
     alike = {path for group in by_size if len(group) > 1 for path in group}
     alike |= {path for path, size in sizes.items() if size in taken_sizes or None in taken_sizes}
-    crowded = {path for group in by_name for path in group[name_plainly(group[0]) not in taken_names :]}
+    crowded = {path for name, group in by_name.items() for path in group[name not in taken_names :]}
     return tuple(sorted(alike | crowded))
 
 
@@ -174,13 +174,6 @@ def assign_names(new: Collection[Path], hashes: Mapping[Path, str], known: Seque
         taken.add(runs[path])
     copies |= {path: runs[first[hashes[path]]] for path in again}
     return Names(runs=runs, copies=copies)
-
-
-def _group(paths: Iterable[Path], label: Callable[[Path], object]) -> list[Sequence[Path]]:
-    groups: dict[object, list[Path]] = {}
-    for path in sorted(paths):
-        groups.setdefault(label(path), []).append(path)
-    return list(groups.values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,7 +272,7 @@ def _name_items(
     open_items: Sequence[Item], items: Sequence[Item], manifests: Mapping[str, Manifest], store: Store
 ) -> list[Item]:
     identities = LogIdentities(store)
-    logs = _list_logs(manifests)
+    logs = {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
     runs = {_path_of(log): run for run, log in logs.items()}
     runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
     new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
@@ -315,10 +308,6 @@ def _know_run(
         size=size if isinstance(size, int) else None,
         is_present=content is not None and content == log.get("sha256"),
     )
-
-
-def _list_logs(manifests: Mapping[str, Manifest]) -> dict[str, Mapping[str, object]]:
-    return {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
 
 
 def _path_of(log: Mapping[str, object]) -> str:
@@ -455,17 +444,13 @@ def prune_results(store: Store, pruning: Pruning) -> Pruned:
         keep -= 1
         removed += store.prune(keep)
         size, errors = measure_results(store)
-    over = () if size <= pruning.quota_bytes else (_over_quota(store, size, pruning.quota_bytes),)
-    return Pruned(removed=tuple(removed), problems=(*errors, *over))
-
-
-def _over_quota(store: Store, size: int, quota: int) -> BatchError:
-    return BatchError(
-        "over_quota",
-        f"the results hold {size / 1e9:.3g} GB without any old generation, more than {quota / 1e9:.3g} GB",
-        where=str(store.root),
-        hint="Raise --quota, or move runs elsewhere",
-    )
+    problems: list[SlipError] = [*errors]
+    if size > pruning.quota_bytes:
+        held, quota = (f"{one / 1e9:.3g} GB" for one in (size, pruning.quota_bytes))
+        what = f"the results hold {held} without any old generation, more than {quota}"
+        hint = "Raise --quota, or move runs elsewhere"
+        problems.append(BatchError("over_quota", what, where=str(store.root), hint=hint))
+    return Pruned(removed=tuple(removed), problems=tuple(problems))
 
 
 def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:

@@ -297,7 +297,9 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     growing = [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
     skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]
-    lines = [*_list_plan(plan), *map(_make_line, result.reports), *_list_remaining(result)]
+    why = "not started: see the other errors"
+    remaining = [Line(path=one.log.path, run=one.run, state="left", reason=why) for one in result.remaining]
+    lines = [*_list_plan(plan), *map(_make_line, result.reports), *remaining]
     return Outcome(
         lines=tuple(sorted((*lines, *growing, *skipped), key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -329,11 +331,9 @@ def _select(todo: Sequence[Item], shard: Shard | None) -> list[Item]:
     """Logs of this machine: selected by the run's name, so that machines need no communication."""
     if shard is None:
         return list(todo)
-    return [item for item in todo if _number(item.run) % shard.count == shard.number - 1]
-
-
-def _number(run: str) -> int:
-    return int.from_bytes(hashlib.sha256(run.encode()).digest()[:8], "big")
+    digests = [hashlib.sha256(item.run.encode()).digest() for item in todo]
+    numbers = [int.from_bytes(digest[:8], "big") % shard.count + 1 for digest in digests]
+    return [item for item, number in zip(todo, numbers, strict=True) if number == shard.number]
 
 
 class _Workforce:
@@ -437,10 +437,3 @@ def _make_line_of(entry: Entry, state: str, report: Report | None = None) -> Lin
         return line
     cost = {name: getattr(entry, name) for name in ("seconds", "fetched_bytes", "peak_bytes")}
     return replace(line, rss_bytes=report.rss_bytes, **cost)
-
-
-def _list_remaining(result: Result) -> list[Line]:
-    return [
-        Line(path=item.log.path, run=item.run, state="left", reason="not started: see the other errors")
-        for item in result.remaining
-    ]

@@ -38,7 +38,7 @@ from pipeline.batch.batch_work import (
     run_guarded,
     work_safely,
 )
-from pipeline.core import THREAD_VARIABLES, MemoryWatchdog, keep_current_folder_out
+from pipeline.core import MemoryWatchdog, prepare_workers
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -70,10 +70,7 @@ class LocalExecutor:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self.depth = settings.jobs
-        # Spawned processes inherit the environment; more threads than cores slow each other down.
-        for variable in THREAD_VARIABLES:
-            os.environ.setdefault(variable, "1")
-        keep_current_folder_out()
+        prepare_workers()
         self._workers: list[_Worker] = []
         self._ended: list[_Worker] = []
         self._watchdog = MemoryWatchdog(settings.memory_bytes)
@@ -343,9 +340,7 @@ def _start_cluster(settings: Settings) -> Client:
     import dask  # noqa: PLC0415 - an extra
     from distributed import Client, LocalCluster  # noqa: PLC0415
 
-    for variable in THREAD_VARIABLES:
-        os.environ.setdefault(variable, "1")
-    keep_current_folder_out()
+    prepare_workers()
     # The guard limits the memory; dask's own limit would pause workers before it.
     plain = {
         "distributed.scheduler.allowed-failures": 0,

@@ -179,6 +179,12 @@ def print_note(text: str) -> None:
     sys.stderr.flush()
 
 
+def print_warnings(texts: Iterable[str]) -> None:
+    """Print warnings on standard error, a line each."""
+    for text in texts:
+        print_note(f"slip: {text}")
+
+
 @contextmanager
 def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]:
     """Tell on stderr what is being done: a spinner on a terminal, plain lines otherwise."""

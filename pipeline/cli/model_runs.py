@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from pipeline import datasets, models, sources
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
@@ -21,15 +22,13 @@ from pipeline.cli.conventions import (
     print_lines,
     print_note,
     print_result,
+    print_warnings,
 )
 from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError, format_count
 
 if TYPE_CHECKING:
-    from pipeline.datasets import Forecast
     from pipeline.estimation.estimation_data import EstimationData
-    from pipeline.models import LiteratureModel, Model, ModelFile
     from pipeline.run import MotionRun
-    from pipeline.sources import Owner, Vehicle
     from pipeline.store import Manifest
 
 
@@ -41,28 +40,22 @@ def trust_named(path: Path | None, *, wanted: bool) -> None:
     """
     if path is None or not wanted:
         return
-    from pipeline.models import list_code  # noqa: PLC0415 - heavy
-    from pipeline.models import trust as trust_hashes  # noqa: PLC0415
-
-    trust_hashes(list_code(path))
+    models.trust(models.list_code(path))
 
 
-def open_model(path: Path, *, trust_code: bool) -> ModelFile:
+def open_model(path: Path, *, trust_code: bool) -> models.ModelFile:
     """Read a model file, and say on the screen what of it is left out.
 
     Raises:
         MotionError: the file is wrong.
     """
-    from pipeline.models import read_model  # noqa: PLC0415 - heavy
-
     trust_named(path, wanted=trust_code)
-    file = read_model(path)
-    for warning in file.warnings:
-        print_note(f"slip: {warning}")
+    file = models.read_model(path)
+    print_warnings(file.warnings)
     return file
 
 
-def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -> ModelFile:
+def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -> models.ModelFile:
     """Read a model file that is to be written again, and say what of it is left out, once.
 
     Args:
@@ -74,19 +67,17 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
         MotionError: the file is wrong, effects of it would be lost, or Python that is not trusted may define
             one of the names.
     """
-    from pipeline.models import format_model, list_effects, read_model  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
 
     trust_named(path, wanted=trust_code)
-    file = read_model(path)
-    format_model(file)
-    known = {*file.own, *(effect.id for effect in list_effects())}
+    file = models.read_model(path)
+    models.format_model(file)
+    known = {*file.own, *(effect.id for effect in models.list_effects())}
     if file.warnings and (unknown := [name for name in names if name not in known]):
         what = f"{', '.join(unknown)} can only come from Python that is not trusted, and that is not run"
         hint = f"Read it, then trust it: slip model trust {shlex.quote(str(path))}"
         raise MotionError("untrusted_effect", what, where=str(path), hint=hint)
-    for warning in file.warnings:
-        print_note(f"slip: {warning}")
+    print_warnings(file.warnings)
     return file
 
 
@@ -100,14 +91,13 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models import draft_effect, write_text  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
 
-    text = draft_effect(file)
+    text = models.draft_effect(file)
     if file.exists() and not force:
         what, hint = "the file already exists", "Give --force to replace it."
         raise MotionError("effect_exists", what, where=str(file), hint=hint)
-    write_text(file, text, code="effect_unwritable")
+    models.write_text(file, text, code="effect_unwritable")
     if not quiet:
         where, model = shlex.quote(str(file)), shlex.quote(str(file.with_name("robot.toml")))
         print_lines(
@@ -131,11 +121,8 @@ def trust(files: list[Path], /, *, json: bool = False) -> int:
         files: model files, or Python files.
         json: print one JSON object.
     """
-    from pipeline.models import list_code  # noqa: PLC0415 - heavy
-    from pipeline.models import trust as trust_hashes  # noqa: PLC0415
-
-    hashes = {code: name for path in files for code, name in list_code(path).items()}
-    trust_hashes(hashes)
+    hashes = {code: name for path in files for code, name in models.list_code(path).items()}
+    models.trust(hashes)
     return _print(hashes, "names no Python", json=json)
 
 
@@ -146,18 +133,16 @@ def untrust(codes: list[str], /, *, json: bool = False) -> int:
         codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
         json: print one JSON object.
     """
-    from pipeline.models import distrust, list_code, list_trusted  # noqa: PLC0415
-
     gone: dict[str, str] = {}
-    known = list_trusted()
+    known = models.list_trusted()
     for word in codes:
         meant = (
-            list_code(Path(word))
+            models.list_code(Path(word))
             if Path(word).exists()
             else [code for code in known if code.startswith(word)]
         )
         gone |= {code: known[code] for code in meant if code in known}
-    distrust(set(gone))
+    models.distrust(set(gone))
     return _print(gone, "none of it was trusted", json=json)
 
 
@@ -167,9 +152,7 @@ def trusted(*, json: bool = False) -> int:
     Args:
         json: print one JSON object.
     """
-    from pipeline.models import list_trusted  # noqa: PLC0415 - heavy
-
-    return _print(list_trusted(), "no Python is trusted", json=json)
+    return _print(models.list_trusted(), "no Python is trusted", json=json)
 
 
 def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
@@ -180,8 +163,13 @@ def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
 
 
 def gather_runs(
-    names: Sequence[str], vehicle: Vehicle | None, owner: Owner | None, out: Path, *, quiet: bool
-) -> tuple[Vehicle, list[MotionRun]]:
+    names: Sequence[str],
+    vehicle: sources.Vehicle | None,
+    owner: sources.Owner | None,
+    out: Path,
+    *,
+    quiet: bool,
+) -> tuple[sources.Vehicle, list[MotionRun]]:
     """Runs by name of a log or of a stored run, read with one vehicle's geometry; results stay as they are.
 
     Args:
@@ -197,8 +185,6 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
-    from pipeline.datasets import read_runs  # noqa: PLC0415 - heavy
-
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
     options = Options(out=out, report=False, diagnosis=True)
@@ -207,13 +193,13 @@ def gather_runs(
     for name in names:
         with open_shown(name, options, quiet=quiet, notify=notes.append) as opened:
             manifests.append(opened.manifest)
-    recordings = read_runs(manifests, vehicle, owner)
+    recordings = datasets.read_runs(manifests, vehicle, owner)
     for note in notes:
         print_note(note)
     return recordings
 
 
-def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path) -> ModelFile:
+def judge_measured(file: models.ModelFile, target: str, names: Sequence[str], out: Path) -> models.ModelFile:
     """A model as `slip model fit --input measured` would write it, for a target that writes held-out errors.
 
     Args:
@@ -269,13 +255,12 @@ def read_metres(text: str) -> float:
         MotionError: ``bad_tolerance``.
     """
     from pipeline.run import MotionError  # noqa: PLC0415 - heavy
-    from pipeline.sources import LENGTH_UNITS  # noqa: PLC0415
 
     match = _METRES.fullmatch(text.strip())
     if match is None:
         what = f"{text!r} is not a length"
         raise MotionError("bad_tolerance", what, where="--within", hint="Write 10cm or 0.1m.")
-    return float(match[1]) * LENGTH_UNITS[match[2]]
+    return float(match[1]) * sources.LENGTH_UNITS[match[2]]
 
 
 def require_model(path: Path | None) -> Path:
@@ -317,8 +302,8 @@ def cut_first(runs: Sequence[MotionRun], first_s: float) -> list[MotionRun]:
 
 
 def forecast_runs(
-    runs: Sequence[MotionRun], vehicle: Vehicle, source: Literal["command", "measured"], out: Path
-) -> Forecast:
+    runs: Sequence[MotionRun], vehicle: sources.Vehicle, source: Literal["command", "measured"], out: Path
+) -> datasets.Forecast:
     """The fleet's prior on the ground of these runs, which themselves do not count.
 
     Raises:
@@ -340,21 +325,22 @@ def forecast_runs(
     return forecast_deployment(Store(out), vehicle.id, terrains[0], source, without=without)
 
 
-def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: bool) -> ModelFile:
+def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: bool) -> models.ModelFile:
     """The model of the fleet's prior for the vehicle and the ground of runs.
 
     Raises:
         SlipError: a log cannot be read, runs are of several vehicles, or there is no fleet.
     """
     from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415
-    from pipeline.models import Model, ModelFile  # noqa: PLC0415 - heavy
 
     vehicle, runs = gather_runs(names, None, None, out, quiet=quiet)
     chosen = choose_input(runs, source)
-    return ModelFile(Model(vehicle, forecast_runs(runs, vehicle, chosen.source.value, out).effects))
+    return models.ModelFile(
+        models.Model(vehicle, forecast_runs(runs, vehicle, chosen.source.value, out).effects)
+    )
 
 
-def tie_to_fleet(data: EstimationData, model: Model, out: Path) -> EstimationData:
+def tie_to_fleet(data: EstimationData, model: models.Model, out: Path) -> EstimationData:
     """The data with the fleet's forecast as prior.
 
     Raises:
@@ -368,14 +354,12 @@ def tie_to_fleet(data: EstimationData, model: Model, out: Path) -> EstimationDat
 
 def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:
     """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
-    from pipeline.models import cut_interval, find_effect  # noqa: PLC0415 - heavy
-
     values: dict[str, dict[str, object]] = {}
     for label, (mean, deviation) in data.paths[0].prior.numbers.items():
         effect, _, name = label.partition(".")
         half = NORMAL_95 * deviation
-        parameter = find_effect(effect)().parameter(name)
-        low, high = cut_interval(mean - half, mean + half, parameter.bounds)
+        parameter = models.find_effect(effect)().parameter(name)
+        low, high = models.cut_interval(mean - half, mean + half, parameter.bounds)
         values[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
     return values
 
@@ -398,16 +382,14 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
         name: a model of the literature.
         json: print one JSON object.
     """
-    from pipeline.models import MODELS, find_model  # noqa: PLC0415 - heavy
-
     if name is None:
-        rows = [_list_model(model) for model in MODELS]
-        return print_result({"models": [_as_json(model) for model in MODELS]}, lambda: rows, json=json)
-    model = find_model(name)
+        rows = [_list_model(model) for model in models.MODELS]
+        return print_result({"models": [_as_json(model) for model in models.MODELS]}, lambda: rows, json=json)
+    model = models.find_model(name)
     return print_result(_as_json(model), lambda: _format_model(model), json=json)
 
 
-def _as_json(model: LiteratureModel) -> dict[str, object]:
+def _as_json(model: models.LiteratureModel) -> dict[str, object]:
     return {
         "name": model.name,
         "title": model.title,
@@ -422,13 +404,13 @@ def _as_json(model: LiteratureModel) -> dict[str, object]:
     }
 
 
-def _list_model(model: LiteratureModel) -> str:
+def _list_model(model: models.LiteratureModel) -> str:
     number = model.count_numbers()
     count = format_count(number, "number")
     return f"{model.name:<28} {count:<14} {model.title}"
 
 
-def _format_model(model: LiteratureModel) -> list[str]:
+def _format_model(model: models.LiteratureModel) -> list[str]:
     lines = [f"{model.name}: {model.title}", "", *(f"    {formula}" for formula in model.formula), ""]
     lines += [f"vehicles  {', '.join(model.kinds)}"]
     lines += [f"needs     {model.needs}"] if model.needs else []
@@ -440,7 +422,7 @@ def _format_model(model: LiteratureModel) -> list[str]:
 
 
 def compare_rivals(
-    files: Mapping[str, ModelFile], spoken: On, against: list[Literal["literature", "learned"]]
+    files: Mapping[str, models.ModelFile], spoken: On, against: list[Literal["literature", "learned"]]
 ) -> int:
     """Fit models, those of the literature and learned ones to runs, and print their held-out errors.
 
@@ -449,17 +431,15 @@ def compare_rivals(
         spoken: the runs, and how the answer is printed.
         against: what they are compared with.
     """
-    from pipeline.datasets import contest_models  # noqa: PLC0415 - heavy
-    from pipeline.models import list_models  # noqa: PLC0415 - heavy
     from pipeline.words import format_contest  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)
     vehicle, runs = gather_runs(spoken.on, known, spoken.vehicle_of, spoken.results, quiet=quiet)
-    contest = contest_models(files, runs, vehicle, against, spoken.input)
+    contest = datasets.contest_models(files, runs, vehicle, against, spoken.input)
     warnings = [text for file in files.values() for text in file.warnings]
     warnings += [contest.chosen.warning] if contest.chosen.warning else []
-    if "literature" in against and len(list_models(vehicle)) == 1:
+    if "literature" in against and len(models.list_models(vehicle)) == 1:
         warnings.append(
             f"no model of the literature but the ideal one describes a {vehicle.kind} vehicle: "
             "`slip model literature` lists each model with its vehicles"
@@ -474,8 +454,7 @@ def compare_rivals(
                 *format_contest(contest.contest),
             ]
         )
-        for text in warnings:
-            print_note(f"slip: {text}")
+        print_warnings(warnings)
     return CLEAN
 
 

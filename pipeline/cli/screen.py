@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
+from pipeline import words
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
 from pipeline.core import (
     INPUT_WORDS,
@@ -282,17 +283,16 @@ def _format_topics(summary: Summary) -> list[str]:
 
 def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
     """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
-    from pipeline.words import list_findings  # noqa: PLC0415 - heavy
-
     findings = read_findings(summary)
     known = {finding.text for finding in findings}
     own = [one for one in read_findings(mapping_in(summary, "diagnosis")) if one.text not in known]
-    return [_row(*row) for row in list_findings({"": [*findings, *own]}, verdict, everything=everything)]
+    return [
+        _row(*row) for row in words.list_findings({"": [*findings, *own]}, verdict, everything=everything)
+    ]
 
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
-    from pipeline.words import VERDICT  # noqa: PLC0415 - heavy
     from pipeline.words.diagnosis import list_lines  # noqa: PLC0415 - heavy
 
     stored = mapping_in(summary, "diagnosis")
@@ -302,7 +302,7 @@ def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     part = ""
     for label, text in list_lines(read_result(stored, RunDiagnosis), everything=everything):
         part = label or part
-        if part not in {VERDICT, "findings"}:
+        if part not in {words.VERDICT, "findings"}:
             described.append(_row(label, text))
     return described
 

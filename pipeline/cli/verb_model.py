@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline import datasets, models, words
 from pipeline.cli.conventions import (
     CLEAN,
     Results,
     TrustCode,
     print_json,
     print_lines,
-    print_note,
     print_result,
+    print_warnings,
 )
 from pipeline.cli.model_runs import (
     Against,
@@ -45,10 +46,8 @@ from pipeline.cli.model_runs import (
 from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from pipeline.datasets import ModelFit
     from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.transfer import Transfer
-    from pipeline.models import Model, ModelFile
     from pipeline.run import MotionRun
 
 
@@ -85,13 +84,6 @@ def new(
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models import (  # noqa: PLC0415 - heavy
-        ModelFile,
-        find_effect,
-        find_model,
-        read_code,
-        write_model,
-    )
     from pipeline.run import MotionError  # noqa: PLC0415
     from pipeline.sources import VehicleSection, resolve_vehicle  # noqa: PLC0415 - heavy
 
@@ -100,13 +92,13 @@ def new(
             "model_exists", "the file already exists", where=str(model), hint="Give --force to replace it."
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
-    made = find_model(template or "ideal").make(chosen)
+    made = models.find_model(template or "ideal").make(chosen)
     for name in effects or ():
-        made = made + find_effect(name)()
+        made = made + models.find_effect(name)()
     files = tuple(path.name for path in own or ())
     for name in files:
-        read_code(model.parent, name)
-    write_model(ModelFile(made, effect_files=files), model)
+        models.read_code(model.parent, name)
+    models.write_model(models.ModelFile(made, effect_files=files), model)
     if not quiet:
         print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}", *_list_idle(made)])
     return CLEAN
@@ -122,18 +114,16 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     """
     from pipeline.estimation.estimates import list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export import export_model  # noqa: PLC0415
-    from pipeline.models import describe_learned, find_learned  # noqa: PLC0415
-    from pipeline.words import format_parameters  # noqa: PLC0415 - heavy
 
     file = open_model(model, trust_code=trust_code)
     if json:
         sys.stdout.write(export_model(file, "json"))
         return CLEAN
-    parameters = format_parameters(list_parameters(file))
+    parameters = words.format_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     lines += _list_idle(file.model)
-    term = find_learned(file.model)
-    lines += [] if term is None else describe_learned(term)
+    term = models.find_learned(file.model)
+    lines += [] if term is None else models.describe_learned(term)
     if runs := file.list_fitted("runs"):
         source = str(file.fit.get("input"))
         names = ", ".join(str(run.get("run")) for run in runs)
@@ -157,12 +147,10 @@ def add(  # noqa: D417 - the shared options document themselves
         effects: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
         anyway: add the effects even if the data do not support them.
     """
-    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
-
     file = open_to_change(model, trust_code=spoken.trust_code, names=effects)
     changed = file.model
     for name in effects:
-        changed = changed + find_effect(name, file.own)()
+        changed = changed + models.find_effect(name, file.own)()
     return _change(model, file, replace(file, model=changed), spoken, must_help=not anyway)
 
 
@@ -254,7 +242,13 @@ def compare(  # noqa: D417 - the shared options document themselves
         seen = "its error there is not a held-out error"
         own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
         held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
-        carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
+        carried = carry_over(
+            file.model,
+            runs,
+            chosen.source,
+            fitted_on=[str(run.get("terrain")) for run in file.list_fitted("runs")],
+            per_run=file.per_run,
+        )
         rows += [(str(path), item) for item in carried]
     warnings = [text for text in (chosen.warning, *own_runs, *(item.warning for _, item in rows)) if text]
     if spoken.json:
@@ -272,7 +266,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     elif not spoken.quiet:
         print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
         print_lines([text for one in held for text in describe_coverage(one)])
-        _warn(warnings)
+        print_warnings(warnings)
     return CLEAN
 
 
@@ -291,7 +285,6 @@ def speed(  # noqa: D417 - the shared options document themselves
     """
     from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415
-    from pipeline.words import format_speed_limits  # noqa: PLC0415
 
     tolerance_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
     opened = open_model(model, trust_code=spoken.trust_code)
@@ -307,10 +300,10 @@ def speed(  # noqa: D417 - the shared options document themselves
         "warnings": [*file.warnings, *warnings],
     }
     if not spoken.json:
-        _warn(warnings)
+        print_warnings(warnings)
     lines = [
         f"{INPUT_WORDS[chosen.source.value]} of {', '.join(run.name for run in runs)} ({chosen.reason})",
-        *format_speed_limits(limits, tolerance_m, ahead_s),
+        *words.format_speed_limits(limits, tolerance_m, ahead_s),
     ]
     return print_result(content, lambda: lines, json=spoken.json, quiet=spoken.quiet)
 
@@ -351,7 +344,6 @@ def export(  # noqa: D417 - the options document themselves
             simulator, traction, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
-    from pipeline.models import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
     opened = open_model(model, trust_code=trust_code)
@@ -359,14 +351,14 @@ def export(  # noqa: D417 - the options document themselves
     if file is None:
         sys.stdout.write(text)
     else:
-        write_text(file, text, code="export_unwritable")
+        models.write_text(file, text, code="export_unwritable")
     return CLEAN
 
 
 def _change(
     path: Path | None,
-    before: ModelFile,
-    after: ModelFile,
+    before: models.ModelFile,
+    after: models.ModelFile,
     spoken: On,
     *,
     predict: Sequence[str] = (),
@@ -379,16 +371,14 @@ def _change(
     Raises:
         MotionError: ``no_help``, with ``must_help``: the file is unchanged.
     """
-    from pipeline.datasets import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
-    from pipeline.models import format_model, write_model  # noqa: PLC0415
 
     # Excluded effects would be lost from the file: raise this error before a long fit.
-    format_model(after)
+    models.format_model(after)
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
     model = after.model
-    fit = fit_to_runs(
+    fit = datasets.fit_to_runs(
         before,
         after,
         runs if first_s is None else cut_first(runs, first_s),
@@ -401,7 +391,7 @@ def _change(
     said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
     written = replace(fit.file, fit={**fit.file.fit, **said})
     if path is not None:
-        write_model(written, path)
+        models.write_model(written, path)
     terrains = [run.terrain for run in runs]
     provenance = {"fitted_on": terrains, "per_run": written.per_run}
     carried = carry_over(written.model, others, fit.chosen.source, **provenance) if others else []
@@ -422,29 +412,26 @@ def _change(
         if carried:
             lines += ["", *_format_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
-        _warn(warnings)
+        print_warnings(warnings)
     return CLEAN
 
 
-def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None:
+def _require_help(path: str, fit: datasets.ModelFit, refusals: Mapping[str, str]) -> None:
     from pipeline.run import MotionError  # noqa: PLC0415
-    from pipeline.words import format_refusals  # noqa: PLC0415 - heavy
 
     added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
     hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
-    what = f"{format_refusals(refusals)}: the model is unchanged"
+    what = f"{words.format_refusals(refusals)}: the model is unchanged"
     raise MotionError("no_help", what, where=path, hint=f"{hint}, or give --anyway")
 
 
-def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
+def _gather(
+    spoken: On, file: models.ModelFile, names: Sequence[str]
+) -> tuple[models.ModelFile, list[MotionRun]]:
     """The file with the vehicle whose geometry is used, and the runs."""
     quiet = spoken.quiet or spoken.json
     vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.results, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs
-
-
-def _terrains(file: ModelFile) -> list[str]:
-    return [str(run.get("terrain")) for run in file.list_fitted("runs")]
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
@@ -462,41 +449,35 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
+def _format_change(fit: datasets.ModelFit, refusals: Mapping[str, str]) -> list[str]:
     from pipeline.estimation.estimates import parameters_as_json  # noqa: PLC0415 - heavy
-    from pipeline.words import (  # noqa: PLC0415 - heavy
-        describe_step,
-        format_ladder,
-        format_parameters,
-        format_recordings,
-        format_refusals,
-    )
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.data.names)
     lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
-    lines += format_recordings([run_residuals.run for run_residuals in new.data.residuals_by_run])
+    lines += words.format_recordings([run_residuals.run for run_residuals in new.data.residuals_by_run])
     if old is not new:
-        lines += ["", "before", *format_ladder(old.ladder, fit.floor), "", "after"]
-    lines += format_ladder(new.ladder, fit.floor)
+        lines += ["", "before", *words.format_ladder(old.ladder, fit.floor), "", "after"]
+    lines += words.format_ladder(new.ladder, fit.floor)
     if old is not new:
-        lines += describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
+        lines += words.describe_step(
+            old.whole, new.whole, words.format_refusals(refusals) if refusals else ""
+        )
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = parameters_as_json(new.fitted.model, new.estimates)
     prior = prior_as_json(new.data)
-    lines += ["", "parameters", *format_parameters(parameters)]
-    return [*lines, "", "prior", *format_parameters(prior)] if prior else lines
+    lines += ["", "parameters", *words.format_parameters(parameters)]
+    return [*lines, "", "prior", *words.format_parameters(prior)] if prior else lines
 
 
 def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.words import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
-    lines = list(format_heads("held-out error of"))
+    lines = list(words.format_heads("held-out error of"))
     for name, item in rows:
-        lines.append(format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
-        lines.append(format_measured_errors(f"  {Path(name).name} as given", item.carried.pooled))
-        lines.append(format_measured_errors("  refitted to this run", item.own.pooled))
+        lines.append(words.format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
+        lines.append(words.format_measured_errors(f"  {Path(name).name} as given", item.carried.pooled))
+        lines.append(words.format_measured_errors("  refitted to this run", item.own.pooled))
         lines.append(f"  error as given over error refitted: {item.ratio:.2f}")
     return lines
 
@@ -505,13 +486,6 @@ def _list_effects(ids: Sequence[str]) -> str:
     return ", ".join(ids) if ids else "the ideal model, no effect"
 
 
-def _list_idle(model: Model) -> list[str]:
+def _list_idle(model: models.Model) -> list[str]:
     """Effects that do not act, since the model lacks what they act beside."""
-    from pipeline.models import explain_idle  # noqa: PLC0415 - heavy
-
-    return [f"  ! {effect.id} {why}" for effect in model if (why := explain_idle(effect, model.ids))]
-
-
-def _warn(warnings: Sequence[str]) -> None:
-    for text in warnings:
-        print_note(f"slip: {text}")
+    return [f"  ! {effect.id} {why}" for effect in model if (why := models.explain_idle(effect, model.ids))]

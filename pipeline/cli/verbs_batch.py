@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, CycloptsError, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from pipeline import datasets
 from pipeline.batch import (
     Pruning,
     Request,
@@ -43,7 +44,6 @@ from pipeline.core import SlipError, align_rows, measure_memory, slip_command
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Line, Outcome
     from pipeline.batch.notices import Looked, Notice
-    from pipeline.datasets import Baseline, Limits
     from pipeline.models import ModelFile
 
 _MEMORY_SHARE = 0.8
@@ -81,7 +81,7 @@ class Afterwards:
         ),
     ] = None
 
-    def open_references(self) -> tuple[dict[str, ModelFile | Baseline], Limits | None]:
+    def open_references(self) -> tuple[dict[str, ModelFile | datasets.Baseline], datasets.Limits | None]:
         """The baselines by name, and the limits."""
         if self.limits is not None and not self.check:
             raise SlipError(
@@ -92,10 +92,9 @@ class Afterwards:
         if not self.check:
             return {}, None
         from pipeline.batch.notices import open_reference  # noqa: PLC0415 - heavy
-        from pipeline.datasets import read_limits  # noqa: PLC0415 - heavy
 
         opened = {str(path): open_reference(path) for path in self.check}
-        return opened, None if self.limits is None else read_limits(self.limits)
+        return opened, None if self.limits is None else datasets.read_limits(self.limits)
 
 
 def run(  # noqa: D417 - the shared choices document themselves
@@ -215,7 +214,7 @@ def _look_after(
     outcome: Outcome,
     root: Path,
     afterwards: Afterwards,
-    references: tuple[Mapping[str, ModelFile | Baseline], Limits | None],
+    references: tuple[Mapping[str, ModelFile | datasets.Baseline], datasets.Limits | None],
     lines: Sequence[str],
 ) -> _After:
     code = FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN

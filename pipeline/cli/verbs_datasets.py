@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import datasets, words
 from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
 from pipeline.core import (
     INPUT_WORDS,
@@ -23,7 +24,6 @@ from pipeline.core import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.datasets import Answer, Question
     from pipeline.store import Store
 
 
@@ -74,7 +74,6 @@ def compare(  # noqa: D417 - arguments document themselves
     from pipeline.datasets import Question, compare_results  # noqa: PLC0415 - heavy
     from pipeline.report.comparison_page import write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.words import summarize_answer  # noqa: PLC0415 - heavy
 
     # Alone or before datasets, a folder is that of the results.
     is_folder = len(datasets) == 1 or (datasets and Path(datasets[0]).is_dir())
@@ -87,7 +86,7 @@ def compare(  # noqa: D417 - arguments document themselves
         return _compare_causes(store, question, figures, everything=everything, json=json, quiet=quiet)
     answer = compare_results(store, question)
     written = write_answer(store, answer, figures)
-    content = {**summarize_answer(answer), "page": _find_page(written, "comparison.html")}
+    content = {**words.summarize_answer(answer), "page": _find_page(written, "comparison.html")}
     return print_result(
         content, lambda: _format_answer(answer, written, everything=everything), json=json, quiet=quiet
     )
@@ -99,24 +98,18 @@ _LEAST_SHARE = 0.01
 
 def _compare_causes(
     store: Store,
-    question: Question,
+    question: datasets.Question,
     figures: FigureFormat | None,
     *,
     everything: bool,
     json: bool,
     quiet: bool,
 ) -> int:
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        find_causes,
-        list_differences,
-        name_causes,
-        summarize_causes,
-    )
     from pipeline.report.fleet_pages import write_causes  # noqa: PLC0415 - heavy
 
-    causes = find_causes(store, question)
+    causes = datasets.find_causes(store, question)
     written = write_causes(store, causes, figures)
-    content, names = summarize_causes(causes), name_causes(causes.names)
+    content, names = datasets.summarize_causes(causes), datasets.name_causes(causes.names)
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
         shown = [one for one in budget.parts if everything or abs(one.share) >= _LEAST_SHARE]
@@ -126,7 +119,7 @@ def _compare_causes(
         rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
         lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
     lines += [""] * bool(causes.differences)
-    lines += list_differences(causes.differences if everything else causes.differences[:_FEW], names)
+    lines += datasets.list_differences(causes.differences if everything else causes.differences[:_FEW], names)
     if not everything and len(causes.differences) > _FEW:
         lines.append(f"{len(causes.differences) - _FEW} more differences (--all, page)")
     page = _find_page(written, "causes.html")
@@ -151,9 +144,7 @@ def _list_notes(notes: Sequence[str], *, everything: bool) -> list[str]:
     return [*lines, f"  {rest} (--all, page)"] if len(notes) > len(shown) else lines
 
 
-def _format_answer(answer: Answer, written: Mapping[str, Path], *, everything: bool) -> list[str]:
-    from pipeline.datasets import MEASURES, compare_orders  # noqa: PLC0415 - heavy
-    from pipeline.words import list_shown_notes, title_line  # noqa: PLC0415 - heavy
+def _format_answer(answer: datasets.Answer, written: Mapping[str, Path], *, everything: bool) -> list[str]:
     from pipeline.words.comparison import list_lines  # noqa: PLC0415 - heavy
 
     lines: list[str] = []
@@ -161,19 +152,19 @@ def _format_answer(answer: Answer, written: Mapping[str, Path], *, everything: b
     for line in list_lines(answer):
         if line.input != answer.input and not everything:
             continue
-        if title_line(line) != title:
-            title = title_line(line)
+        if words.title_line(line) != title:
+            title = words.title_line(line)
             lines += [""] * bool(lines) + [f"slip of {title}"]
         lines.append(f"  {line.driving:<18}{line.text}")
     for name in answer.inputs if everything else ():
         lines += ["", *_format_datasets(answer, name), *_format_pairs(answer, name)]
-    orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
-    sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
+    orders = datasets.compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
+    sentences = [one.text for one in orders if one.tau is None or datasets.MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
     others = [INPUT_WORDS[name] for name in answer.inputs if name != answer.input]
     rest = ", ".join([*others, "all datasets and pairs with intervals"])
     lines += [] if everything else ["", f"{rest}: --all, or the page"]
-    notes = _list_notes(list_shown_notes(answer), everything=everything)
+    notes = _list_notes(words.list_shown_notes(answer), everything=everything)
     return [
         *lines,
         *([""] if notes else []),
@@ -190,7 +181,7 @@ def _find_page(written: Mapping[str, Path], name: str) -> str | None:
     return str(written[name]) if name in written else None
 
 
-def _format_datasets(answer: Answer, name: str) -> list[str]:
+def _format_datasets(answer: datasets.Answer, name: str) -> list[str]:
     """Medians of the datasets on an input, as driven and at equal driving."""
     driven, equal = (answer.find_view(name, equal=one) for one in (False, True))
     if driven is None:
@@ -222,10 +213,8 @@ def _format_ends(row: Mapping[str, object]) -> str:
     return " to ".join(split_interval(value, low, high)[1:])
 
 
-def _format_pairs(answer: Answer, name: str) -> list[str]:
+def _format_pairs(answer: datasets.Answer, name: str) -> list[str]:
     """One line a pair, the surest first."""
-    from pipeline.words import list_pairs  # noqa: PLC0415 - heavy
-
     rows = [
         (
             f"{pair.hard} / {pair.easy}",
@@ -234,7 +223,7 @@ def _format_pairs(answer: Answer, name: str) -> list[str]:
             pair.common,
             pair.carrier,
         )
-        for pair in list_pairs(answer, name)
+        for pair in words.list_pairs(answer, name)
     ]
     if not rows:
         return []
@@ -291,7 +280,6 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import ZONES, draw_up_map, read_features  # noqa: PLC0415 - heavy
     from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -311,8 +299,8 @@ def draw(  # noqa: D417 - arguments document themselves
         raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
     store = Store(results) if results == Path("results") else open_results(results).open_store()
-    features = None if shared is None else read_features(shared)
-    drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
+    features = None if shared is None else datasets.read_features(shared)
+    drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)
     content = {
         "deployments": drawn.points.to_dicts(),
@@ -328,8 +316,10 @@ def draw(  # noqa: D417 - arguments document themselves
         for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
     ]
     if lines:
-        bounds = ", ".join(f"{name} below {end:g}" for name, end in ZONES[:-1])
-        lines.append(f"risk    by log10(energy / J) + complexity / 10: {bounds}, {ZONES[-1][0]} above")
+        bounds = ", ".join(f"{name} below {end:g}" for name, end in datasets.ZONES[:-1])
+        lines.append(
+            f"risk    by log10(energy / J) + complexity / 10: {bounds}, {datasets.ZONES[-1][0]} above"
+        )
     placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
     lines += [f"! {note}" for note in drawn.notes]
     lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")
@@ -338,19 +328,16 @@ def draw(  # noqa: D417 - arguments document themselves
 
 def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
     """Write the terrain map of slip by position."""
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        CELL_M,
-        describe_terrain,
-        draw_up_terrain,
-        list_lines,
-    )
     from pipeline.report.fleet_pages import write_terrain  # noqa: PLC0415 - heavy
 
     store = open_results(results).open_store()
-    drawn = draw_up_terrain(store, cell_m=CELL_M if cell is None else cell, fed=fed)
+    drawn = datasets.draw_up_terrain(store, cell_m=datasets.CELL_M if cell is None else cell, fed=fed)
     written = write_terrain(store, drawn)
-    content = {**describe_terrain(drawn), "written": {name: str(path) for name, path in written.items()}}
-    return print_result(content, lambda: list_lines(drawn, written), json=json, quiet=quiet)
+    content = {
+        **datasets.describe_terrain(drawn),
+        "written": {name: str(path) for name, path in written.items()},
+    }
+    return print_result(content, lambda: datasets.list_lines(drawn, written), json=json, quiet=quiet)
 
 
 def _format_value(value: float | None, unit: str) -> str:
@@ -375,10 +362,10 @@ def merge(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
-
-    merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
-    write_features(merged, file)
+    merged, twice = datasets.merge_features(
+        [datasets.read_features(path) for path in (first, second)], f"{first} and {second}"
+    )
+    datasets.write_features(merged, file)
     runs = merged["sha256"].n_unique()
     content = {"file": str(file), "runs": runs, "rows": merged.height, "twice": twice}
     line = f"{file}: {runs} runs, {merged.height} rows, {twice} duplicates"
@@ -401,11 +388,10 @@ def share(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import gather_features, write_features  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    features, notes = gather_features(Store(results))
-    write_features(features, file)
+    features, notes = datasets.gather_features(Store(results))
+    datasets.write_features(features, file)
     runs = features["sha256"].n_unique()
     content = {"file": str(file), "runs": runs, "rows": features.height, "notes": list(notes)}
     lines = [f"{file}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import estimation, sources
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
@@ -30,11 +31,9 @@ from pipeline.core import SlipError, align_rows, format_count, format_duration
 if TYPE_CHECKING:
     from pipeline.analysis import Options
     from pipeline.datasets import Forecast
-    from pipeline.estimation import Recording
     from pipeline.plan import Plan
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
-    from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
 
@@ -170,8 +169,8 @@ def _format_known(forecast: Forecast | None) -> list[str]:
 class _Gathered(NamedTuple):
     """Runs of one vehicle, how the command of the first of them was chosen, and whether one had losses."""
 
-    vehicle: Vehicle
-    recordings: list[Recording]
+    vehicle: sources.Vehicle
+    recordings: list[estimation.Recording]
     manifests: list[Manifest]
     command: dict[str, object]
     lossy: bool
@@ -208,12 +207,11 @@ def _gather(
     return _Gathered(vehicles[0], recordings, manifests, chosen, lossy)
 
 
-def _find_vehicle(name: str | None) -> Vehicle:
-    from pipeline.sources import find_preset, list_presets  # noqa: PLC0415 - heavy
+def _find_vehicle(name: str | None) -> sources.Vehicle:
 
-    vehicle = None if name is None else find_preset(name)
+    vehicle = None if name is None else sources.find_preset(name)
     if vehicle is None:
-        known = ", ".join(preset.id for preset in list_presets())
+        known = ", ".join(preset.id for preset in sources.list_presets())
         what = "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}"
         raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
     return vehicle
@@ -221,7 +219,6 @@ def _find_vehicle(name: str | None) -> Vehicle:
 
 def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
     """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
-    from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
     from pipeline.plan import check_plan, read_plan, require_played  # noqa: PLC0415 - heavy
 
     stored = read_plan(path)
@@ -238,9 +235,9 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
-        driven = [load_recording(recording, vehicle) for recording in drive.recordings]
+        driven = [estimation.load_recording(recording, vehicle) for recording in drive.recordings]
         require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
-        diagnosis = diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
+        diagnosis = estimation.diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
     checked = check_plan(stored, diagnosis)
     following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
     if json:

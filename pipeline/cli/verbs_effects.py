@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from pipeline import estimation, models, sources, words
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     All,
@@ -34,10 +35,7 @@ from pipeline.cli.conventions import (
 from pipeline.core import INPUTS, SlipError, resolve_inside
 
 if TYPE_CHECKING:
-    from pipeline.estimation import Diagnosis, Recording
-    from pipeline.models import Effect, Model, ModelFile
     from pipeline.results import RunDiagnosis
-    from pipeline.sources import Owner, Vehicle
     from pipeline.store import Manifest
 
 
@@ -74,13 +72,10 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    from pipeline.estimation import parse_budget  # noqa: PLC0415 - heavy
-    from pipeline.models import check_target  # noqa: PLC0415 - heavy
-
     if apply is not None:
-        check_target(apply)
+        models.check_target(apply)
     known = _open_model(model, trust_code=trust_code)
-    budget_s = None if budget is None else parse_budget(budget)
+    budget_s = None if budget is None else estimation.parse_budget(budget)
     diagnosed = Diagnosed()
 
     def conclude(error: SlipError) -> None:
@@ -127,18 +122,14 @@ class Diagnosed:
 
     def to_json(self) -> dict[str, object]:
         """The object of `slip diagnose --json`."""
-        from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
-
         chosen = {one.manifest.run: one.choices for answer in self.answers for one in answer.opened}
-        runs = [{**diagnosis_as_json(run), **chosen[run.run]} for run in self.runs]
+        runs = [{**words.diagnosis_as_json(run), **chosen[run.run]} for run in self.runs]
         return {"runs": runs, "errors": self.errors}
 
     def list_lines(
         self, given: Sequence[str], said: str, applied: Path | None = None, *, everything: bool = False
     ) -> list[str]:
         """Lines for a screen, each answer with the next command, which repeats the flags that were said."""
-        from pipeline.words import describe  # noqa: PLC0415 - heavy
-
         lines = []
         for answer in self.answers:
             names = [run.run for run in answer.runs]
@@ -146,7 +137,7 @@ class Diagnosed:
                 names = list(given)  # a folder is shorter than what it holds
             applying = f"slip diagnose {' '.join(map(shlex.quote, names))}{said} --apply model.toml"
             following = _suggest_next(answer.runs, applying, applied)
-            lines += describe(answer.runs, following, everything=everything).splitlines()
+            lines += words.describe(answer.runs, following, everything=everything).splitlines()
         return lines
 
     def end(self, *, quiet: bool) -> int:
@@ -164,8 +155,8 @@ def diagnose_logs(
     diagnosed: Diagnosed,
     logs: Sequence[str],
     options: Options,
-    known: ModelFile | None = None,
-    owner: Owner | None = None,
+    known: models.ModelFile | None = None,
+    owner: sources.Owner | None = None,
     budget_s: float | None = None,
     *,
     quiet: bool,
@@ -181,9 +172,9 @@ def diagnose_logs(
         budget_s: CPU time of a search [s]; None for the usual one.
         quiet: print no progress.
     """
+    diagnosed.at_work = logs[0]
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
 
-    diagnosed.at_work = logs[0]
     opened: dict[str, _Opened] = {}
     # A diagnosis with default options is unique, and is stored for later requests.
     is_plain = known is None and budget_s is None and options.inputs == INPUTS
@@ -204,16 +195,14 @@ def diagnose_logs(
 def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | None) -> str:
     """The next command: to export an applied model, to add a suggested term, or to apply."""
     if applied is not None:
-        from pipeline.words import suggest_export  # noqa: PLC0415 - heavy
-
         kind = next((one.vehicle.kind for one in runs if one.vehicle is not None), "")
-        return suggest_export(kind, str(applied))
+        return words.suggest_export(kind, str(applied))
     if suggested := next((one.run for one in runs if one.has_suggestion), None):
         return f"slip serve {shlex.quote(suggested)}    add the suggested term there"
     return applying
 
 
-def _open_model(path: Path | None, *, trust_code: bool) -> ModelFile | None:
+def _open_model(path: Path | None, *, trust_code: bool) -> models.ModelFile | None:
     """The named model, if one is named."""
     if path is None:
         return None
@@ -224,12 +213,12 @@ def _open_model(path: Path | None, *, trust_code: bool) -> ModelFile | None:
 
 def _gather(
     logs: Sequence[str], options: Options, diagnosed: Diagnosed, opened: dict[str, _Opened], *, quiet: bool
-) -> dict[str, tuple[Vehicle, list[Recording]]]:
+) -> dict[str, tuple[sources.Vehicle, list[estimation.Recording]]]:
     """Recordings by vehicle; ``opened`` receives the data read of each run."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
     from pipeline.store import read_choices  # noqa: PLC0415 - heavy
 
-    gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
+    gathered: dict[str, tuple[sources.Vehicle, list[estimation.Recording]]] = {}
     for log in logs:
         diagnosed.at_work = log
         try:
@@ -265,11 +254,16 @@ class _Answer:
 
     runs: Sequence[RunDiagnosis]
     opened: Sequence[_Opened]
-    proposal: ModelFile | None
+    proposal: models.ModelFile | None
 
 
 def _answer(
-    search: Callable[[], Diagnosis], opened: Sequence[_Opened], results: Path, *, keeps: bool, quiet: bool
+    search: Callable[[], estimation.Diagnosis],
+    opened: Sequence[_Opened],
+    results: Path,
+    *,
+    keeps: bool,
+    quiet: bool,
 ) -> _Answer:
     """The result of a search, or with ``keeps`` the stored result of an earlier one."""
     from pipeline.estimation.stored_diagnosis import find_diagnosis  # noqa: PLC0415 - heavy
@@ -283,7 +277,7 @@ def _answer(
     return _Answer(diagnosis.runs, opened, diagnosis.proposal)
 
 
-def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
+def _keep(results: Path, manifest: Manifest, diagnosis: estimation.Diagnosis, *, quiet: bool) -> None:
     """Store an answer with the results; if they cannot be written, only print a note."""
     from pipeline.estimation.stored_diagnosis import keep_diagnosis  # noqa: PLC0415 - heavy
 
@@ -296,30 +290,31 @@ def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: boo
 
 
 def _agree(
-    known: ModelFile | None, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None
-) -> Vehicle:
-    from pipeline.sources import agree_on_vehicle  # noqa: PLC0415 - heavy
+    known: models.ModelFile | None,
+    vehicle: sources.Vehicle,
+    recordings: list[estimation.Recording],
+    owner: sources.Owner | None,
+) -> sources.Vehicle:
 
     if known is None:
         return vehicle
-    return agree_on_vehicle(known.model.vehicle, {one.name: vehicle for one in recordings}, owner)
+    return sources.agree_on_vehicle(known.model.vehicle, {one.name: vehicle for one in recordings}, owner)
 
 
 def _judge(
-    recordings: list[Recording],
-    vehicle: Vehicle,
+    recordings: list[estimation.Recording],
+    vehicle: sources.Vehicle,
     options: Options,
-    known: ModelFile | None,
+    known: models.ModelFile | None,
     budget_s: float | None,
     *,
     quiet: bool,
-) -> Diagnosis:
-    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
+) -> estimation.Diagnosis:
 
     name = recordings[0].name if len(recordings) == 1 else f"{len(recordings)} runs"
     with show_progress(name, quiet=quiet) as progress:
         progress("diagnosis")
-        return diagnose_runs(
+        return estimation.diagnose_runs(
             recordings,
             vehicle,
             inputs=options.inputs,
@@ -331,7 +326,6 @@ def _judge(
 
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> list[dict[str, str]]:
     """Write the proposed model; the error of there being none, as a JSON object."""
-    from pipeline.models import write_model  # noqa: PLC0415 - heavy
     from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
 
     if not answers:  # the errors were said
@@ -343,7 +337,7 @@ def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> list[dict[
         error = SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
         print_error(error)
         return [summarize_error(str(path), error)]
-    write_model(proposal, path)
+    models.write_model(proposal, path)
     if not quiet:
         print_lines([f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}"])
     return []
@@ -364,16 +358,15 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.models import find_effect, list_effects, list_pages  # noqa: PLC0415 - heavy
     from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
 
-    chosen = list_effects() if effect is None else (find_effect(effect),)
-    pages = list_pages(chosen) if effect is None else [format_effect(chosen[0])]
+    chosen = models.list_effects() if effect is None else (models.find_effect(effect),)
+    pages = models.list_pages(chosen) if effect is None else [format_effect(chosen[0])]
     content = {"effects": [_as_json(item) for item in chosen]}
     return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
 
 
-def _as_json(effect: type[Effect]) -> dict[str, object]:
+def _as_json(effect: type[models.Effect]) -> dict[str, object]:
     from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
 
     return {
@@ -453,7 +446,7 @@ def export(  # noqa: D417 - the results folder documents itself
     return print_result(content, lambda: files, json=json, quiet=quiet)
 
 
-def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
+def _find_named(manifest: Manifest) -> tuple[models.Model | None, str | None]:
     """The model of the run's diagnosis, and its input; None if there is none."""
     from pipeline.estimation.stored_diagnosis import read_stored_diagnosis  # noqa: PLC0415 - heavy
     from pipeline.results import read_model  # noqa: PLC0415 - heavy

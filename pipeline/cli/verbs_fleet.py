@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat
 
+from pipeline import datasets, models, words
 from pipeline.cli.conventions import (
     ALERT,
     CLEAN,
@@ -39,14 +40,12 @@ from pipeline.core import (
     format_digits,
     format_interval,
     format_length,
+    group_by,
     suffix_unit,
 )
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
-    from pipeline.datasets import Baseline, Check, Trend
-    from pipeline.models import ModelFile
-    from pipeline.models import Parameter as ModelParameter
     from pipeline.sources import Owner
     from pipeline.store import Manifest
 
@@ -87,12 +86,9 @@ def check(  # noqa: D417 - the arguments document themselves
     """
     _require_target(to, file, json=json)
     _require_runs(after)
-    from pipeline.datasets import check_as_json, check_runs, keep_baseline, read_limits  # noqa: PLC0415 - heavy
-    from pipeline.models import write_text  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.words import format_lines, list_lines  # noqa: PLC0415 - heavy
 
-    bounds = None if limits is None else read_limits(limits)
+    bounds = None if limits is None else datasets.read_limits(limits)
     options = build_options(Choices(results=results))
     known = _open_known(before, trust_code=trust_code)
     silent = quiet or json or (to is not None and file is None)
@@ -100,7 +96,7 @@ def check(  # noqa: D417 - the arguments document themselves
         first = _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
         second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
         owner: Owner | None = vehicle_of
-        checked = check_runs(
+        checked = datasets.check_runs(
             first,
             second,
             Store(results),
@@ -109,25 +105,25 @@ def check(  # noqa: D417 - the arguments document themselves
             limits=bounds,
             simulated=simulated,
         )
-    lines = list_lines(checked)
+    lines = words.list_lines(checked)
     if to is not None:
         text = _render(checked, to)
         if file is None:
             sys.stdout.write(text)
         else:
-            write_text(file, text, code="check_unwritable")
+            models.write_text(file, text, code="check_unwritable")
     # The check is also printed if the baseline is not replaced.
     unkept: list[SlipError] = []
     try:
         if keep is not None:
-            keep_baseline(checked, keep)
+            datasets.keep_baseline(checked, keep)
     except SlipError as error:
         unkept = [error]
     if json:
         errors = [summarize_error(after, one) for one in unkept]
-        print_json({**check_as_json(checked, lines), "errors": errors})
+        print_json({**datasets.check_as_json(checked, lines), "errors": errors})
     elif not quiet and (to is None or file is not None):
-        print_lines(format_lines(list_lines(checked, everything=everything)))
+        print_lines(words.format_lines(words.list_lines(checked, everything=everything)))
     for one in unkept:
         print_error(one)
     return FAILED if unkept else checked.code
@@ -159,14 +155,12 @@ def _require_runs(after: str) -> None:
         )
 
 
-def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:
+def _open_known(name: str, *, trust_code: bool) -> models.ModelFile | datasets.Baseline | None:
     """Open a name as a model file or a baseline; None for a log, a folder or a run."""
-    from pipeline.datasets import read_baseline  # noqa: PLC0415 - heavy
-
     path = Path(name)
     if path.suffix == ".toml":
         return open_model(path, trust_code=trust_code)
-    return read_baseline(path) if path.suffix == ".json" else None
+    return datasets.read_baseline(path) if path.suffix == ".json" else None
 
 
 def _open_runs(
@@ -183,10 +177,9 @@ def _open_runs(
     return list(manifests.values())
 
 
-def _render(checked: Check, to: Literal["markdown", "junit"]) -> str:
-    from pipeline.words import format_junit, format_markdown  # noqa: PLC0415 - heavy
+def _render(checked: datasets.Check, to: Literal["markdown", "junit"]) -> str:
 
-    return {"markdown": format_markdown, "junit": format_junit}[to](checked)
+    return {"markdown": words.format_markdown, "junit": words.format_junit}[to](checked)
 
 
 _LABEL = 26
@@ -228,14 +221,13 @@ def fit(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import fit_results, summarize_fleet  # noqa: PLC0415 - heavy
     from pipeline.report.fleet_pages import write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(results)
-    model, keys = fit_results(store)
+    model, keys = datasets.fit_results(store)
     path = write_fleet(store, model, keys)
-    content = {**summarize_fleet(model), "file": str(path)}
+    content = {**datasets.summarize_fleet(model), "file": str(path)}
     return print_result(
         content, lambda: _format_fleet(content, everything=everything), json=json, quiet=quiet
     )
@@ -251,10 +243,9 @@ def show(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import read_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    content = read_fleet(Store(results))
+    content = datasets.read_fleet(Store(results))
     return print_result(
         content, lambda: _format_fleet(content, everything=everything), json=json, quiet=quiet
     )
@@ -275,9 +266,8 @@ def _format_fleet(content: Mapping[str, object], *, everything: bool) -> list[st
         lines += [_format_number(row, width, everything=everything) for row in shown] or [
             "  no significant effect in any of them"
         ]
-        reasons: dict[str, list[str]] = {}
-        for row in own if everything else ():
-            reasons.setdefault(str(row["because"]), []).append(f"{row['effect']}.{row['parameter']}")
+        unsettled = own if everything else ()
+        reasons = group_by((row["because"], f"{row['effect']}.{row['parameter']}") for row in unsettled)
         lines += [f"  {', '.join(labels)}: {because}" for because, labels in reasons.items()]
     notes = [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
     if everything:
@@ -343,8 +333,6 @@ def predict(
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    from pipeline.datasets import prediction as predictions  # noqa: PLC0415 - heavy
-    from pipeline.models import write_model  # noqa: PLC0415
     from pipeline.plan import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415
 
@@ -352,16 +340,15 @@ def predict(
     with show_progress(f"{vehicle} on {terrain}", quiet=quiet or json) as progress:
         forecast = forecast_deployment(store, vehicle, terrain, input, notify=progress)
         progress("driving their commands with drawn parameters")
-        prediction = predictions.predict_deployment(store, forecast)
+        prediction = datasets.predict_deployment(store, forecast)
     if file is not None:
-        write_model(predictions.make_model_file(prediction), file)
-    summary = predictions.summarize_prediction(prediction)
+        models.write_model(datasets.make_model_file(prediction), file)
+    summary = datasets.summarize_prediction(prediction)
     content = {**summary, "model": None if file is None else str(file)}
     return print_result(content, lambda: _format_forecast(content), json=json, quiet=quiet)
 
 
 def _format_forecast(content: Mapping[str, object]) -> list[str]:
-    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
 
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{format_count(cast('int', here), 'run')} there, {elsewhere} elsewhere"
@@ -370,7 +357,7 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
     numbers: dict[str, str] = {}
     for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
         parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
-        kind = find_effect(str(effect["id"]))()
+        kind = models.find_effect(str(effect["id"]))()
         numbers |= {
             f"  {kind.id}.{name}": _format_expected(number, kind.parameter(name))
             for name, number in parameters.items()
@@ -388,7 +375,7 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
     return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
 
 
-def _format_expected(number: Mapping[str, object], parameter: ModelParameter) -> str:
+def _format_expected(number: Mapping[str, object], parameter: models.Parameter) -> str:
     """An expected parameter; a limit at the largest value of its search is none."""
     low, most, unit = number["low"], parameter.bounds[1], suffix_unit(parameter.unit)
     if parameter.neutral == math.inf and number["value"] == most:
@@ -433,7 +420,6 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import check_limits, follow_trend, summarize_trend  # noqa: PLC0415 - heavy
     from pipeline.report.trend_page import write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -442,13 +428,13 @@ def trend(  # noqa: D417 - arguments document themselves
             "bad_limit", f"{threshold} is not a threshold", hint="Write --threshold 0.1 for a tenth"
         )
     limits = dict(map(_read_limit, limit))
-    check_limits(limits)
+    datasets.check_limits(limits)
     store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
-    followed = follow_trend(store, names, threshold=threshold, limits=limits)
+    followed = datasets.follow_trend(store, names, threshold=threshold, limits=limits)
     page = write_trend(store, followed)
     print_result(
-        {**summarize_trend(followed), "page": str(page)},
+        {**datasets.summarize_trend(followed), "page": str(page)},
         lambda: _format_trend(followed, page),
         json=json,
         quiet=quiet,
@@ -471,17 +457,16 @@ def _read_limit(text: str) -> tuple[str, float]:
     return name.strip() or text, limit
 
 
-def _format_trend(followed: Trend, page: Path) -> list[str]:
-    from pipeline.datasets import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
+def _format_trend(followed: datasets.Trend, page: Path) -> list[str]:
 
-    quiet = format_quiet(followed.series, followed.parameters)
+    quiet = datasets.format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
     # The notes list the parameters that could not be judged.
     rows = [
         (
             f"{one.vehicle} {one.label}",
             one.points.height,
-            f"latest {one.shown_latest}, {format_power(one)}",
+            f"latest {one.shown_latest}, {datasets.format_power(one)}",
         )
         for one in followed.parameters
         if not one.need
@@ -493,7 +478,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
             rows.append((group, own[0].points.height, "no slip"))
         else:
             latest = f"latest {slip.latest:.3g}{suffix_unit(slip.unit)}"
-            rows.append((group, slip.points.height, f"{name_quantity(slip.quantity)} {latest}"))
+            rows.append((group, slip.points.height, f"{datasets.name_quantity(slip.quantity)} {latest}"))
     width = max((len(label) for label, _, _ in rows), default=0)
     lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
     lines += [f"! {note}" for note in followed.notes[:_NOTES]]

@@ -116,11 +116,12 @@ def analyze(  # noqa: D417 - the shared choices document themselves
 
 
 def _print_json(outcomes: list[Outcome], errors: list[dict[str, str]]) -> None:
-    print_json({"runs": [_as_json(outcome) for outcome in outcomes], "errors": errors})
-
-
-def _as_json(outcome: Outcome) -> dict[str, object]:
-    return {**outcome.summary, "same_content_as": outcome.twin or None}
+    print_json(
+        {
+            "runs": [{**outcome.summary, "same_content_as": outcome.twin or None} for outcome in outcomes],
+            "errors": errors,
+        }
+    )
 
 
 def _analyze_all(
@@ -463,7 +464,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
         if address is not None:
             live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
         path = choose_recording(log) if live is None else live.path
-        arguments = shlex.split(spell_choices(_without_results(choices)))
+        arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
         watched = Watch(path, options, arguments, quiet_for, live)
         is_screen = sys.stdout.isatty() and not json
         stopped, reported = False, ""
@@ -505,11 +506,6 @@ def _stopping_on_termination() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _without_results(choices: Choices) -> Choices:
-    """The choices for a diagnosis of the log so far, which has its own results folder."""
-    return replace(choices, results=Choices().results)
 
 
 def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:

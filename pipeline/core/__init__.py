@@ -57,9 +57,9 @@ if TYPE_CHECKING:
     from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory, read_memory
     from pipeline.core.processes import (
         PACKAGE,
-        THREAD_VARIABLES,
         end_with,
         keep_current_folder_out,
+        prepare_workers,
         python_command,
         read_version,
         require_package,
@@ -110,6 +110,7 @@ if TYPE_CHECKING:
         format_share,
         format_size,
         format_two,
+        group_by,
         guess_names,
         make_plain,
         mark_finding,

@@ -27,10 +27,19 @@ class Newest(Generic[Result]):
 
     def recall(self, key: Hashable, make: Callable[[], Result]) -> Result:
         """The cached result of a key, computed if it is missing."""
-        result = self._known.pop(key, None)
-        if result is None:
-            result = make()
+        result = self.find(key)
+        return self.keep(key, make()) if result is None else result
+
+    def find(self, key: Hashable) -> Result | None:
+        """The cached result of a key, which is then the newest; None if it is missing."""
+        if key in self._known:
+            self._known.move_to_end(key)
+        return self._known.get(key)
+
+    def keep(self, key: Hashable, result: Result) -> Result:
+        """Cache a result in place of an earlier one of its key, and return it."""
         self._known[key] = result
+        self._known.move_to_end(key)
         while len(self._known) > self._most:
             self._known.popitem(last=False)
         return result

@@ -60,7 +60,7 @@ def require_package(name: str, extra: str, purpose: str, *, otherwise: str = "")
         raise SlipError(f"no_{name}", what, hint=f"{hint}, or {otherwise}" if otherwise else hint)
 
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
 """Environment variables with the number of threads of numerical libraries."""
 
 
@@ -89,6 +89,14 @@ def slip_command(*words: str) -> list[str]:
 def keep_current_folder_out() -> None:
     """Exclude the current folder from the import path of Python processes started by libraries."""
     os.environ["PYTHONSAFEPATH"] = "1"
+
+
+def prepare_workers() -> None:
+    """Give processes started from here one thread each, and no current folder in their import path."""
+    # They inherit the environment; more threads than cores slow each other down.
+    for variable in _THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
+    keep_current_folder_out()
 
 
 def end_with(parent: int) -> None:

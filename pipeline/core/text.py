@@ -3,7 +3,10 @@
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
+
+Key = TypeVar("Key")
+Item = TypeVar("Item")
 
 _READABLE = 300
 """Maximum number of characters of quoted text in a sentence: four lines of a screen."""
@@ -51,6 +54,14 @@ def shorten(text: str, most: int = _READABLE) -> str:
 def make_plain(text: str) -> str:
     """Replace unprintable characters, so that the text fits on one line, or into XML."""
     return "".join(c if c.isprintable() else " " for c in text)
+
+
+def group_by(pairs: Iterable[tuple[Key, Item]]) -> dict[Key, list[Item]]:
+    """The items of every key; keys and items are in the order of the pairs."""
+    groups: dict[Key, list[Item]] = {}
+    for key, item in pairs:
+        groups.setdefault(key, []).append(item)
+    return groups
 
 
 def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:

@@ -79,8 +79,11 @@ if TYPE_CHECKING:
         FLEET,
         find_estimates,
         fit_results,
+        make_model_file,
+        predict_deployment,
         read_fleet,
         summarize_fleet,
+        summarize_prediction,
         tabulate_fleet,
     )
     from pipeline.datasets.rank_tests import kendall_tau, list_swaps

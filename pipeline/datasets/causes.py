@@ -22,6 +22,7 @@ from pipeline.core import (
     finite_or_none,
     format_share,
     format_two,
+    group_by,
     name_first,
     pick,
     pick_finite,
@@ -161,9 +162,7 @@ class Difference:
         if not judged:
             methods = dict.fromkeys(part.method for part in self.parts if part.method)
             return "; ".join([self.note, *(f"intervals by {method}" for method in methods)])
-        causes: dict[str, list[str]] = {}
-        for part in judged:
-            causes.setdefault(part.method, []).append(names[part.name])
+        causes = group_by((part.method, names[part.name]) for part in judged)
         usual = max(causes, key=lambda method: len(causes[method]))
         others = [f"; {', '.join(own)} by {method}" for method, own in causes.items() if method != usual]
         return f"tested by {usual}{''.join(others)}; p after Holm over the causes of a pair"
@@ -413,9 +412,8 @@ def find_causes(store: Store, question: Question) -> Causes:
         raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
     untested = find_untested(compared, question)
     budgets, differences = compare_causes(own, untested=untested)
-    keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
     notes = (*compared.notes, *note_untested(untested))
-    return Causes(budgets, differences, source, find_level_names(store), keys, notes)
+    return Causes(budgets, differences, source, find_level_names(store), compared.keys, notes)
 
 
 def summarize_causes(causes: Causes) -> dict[str, object]:
@@ -471,10 +469,9 @@ def format_difference(one: Difference, names: Mapping[str, str]) -> str:
 
 def list_differences(differences: Sequence[Difference], names: Mapping[str, str]) -> list[str]:
     """Texts of differences, and after all those that were tested alike how they were."""
-    by_tests: dict[str, list[str]] = {}
-    for one in differences:
-        tests = one.describe_tests(_name_parts(one, names))
-        by_tests.setdefault(tests, []).append(format_difference(one, names))
+    by_tests = group_by(
+        (one.describe_tests(_name_parts(one, names)), format_difference(one, names)) for one in differences
+    )
     return [text for tests, texts in by_tests.items() for text in (*texts, tests[:1].upper() + tests[1:])]
 
 

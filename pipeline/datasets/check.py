@@ -21,6 +21,7 @@ from pipeline.core import (
     read_bounded_text,
     require_finite,
     shorten,
+    suffix_unit,
 )
 from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.datasets.check_readings import (
@@ -177,7 +178,7 @@ def judge_limits(limits: Limits, sides: Sides, changes: Mapping[str, Change]) ->
             allowed = bound.change * abs(change.before)
             ends = (change.low, change.high)
             outcome = _compare(ends, -allowed, allowed)
-            text = f"{change.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}] {_unit(units[key])}".strip()
+            text = f"{change.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}]{suffix_unit(units[key])}"
             judged.append(
                 Judged(key, f"change at most {bound.change:.3g} of {change.before:.3g}", text, outcome)
             )
@@ -259,7 +260,7 @@ def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[flo
     low = -math.inf if bound.min is None else bound.min
     high = math.inf if bound.max is None else bound.max
     known = math.isfinite(value) and math.isfinite(ends[0])
-    text = f"{format_interval(value, *ends)} {_unit(unit)}".strip() if known else "not observable"
+    text = f"{format_interval(value, *ends)}{suffix_unit(unit)}" if known else "not observable"
     return [Judged(key, _format_limit(bound, unit), text, _compare(ends, low, high))]
 
 
@@ -272,11 +273,7 @@ def _compare(ends: tuple[float, float], low: float, high: float) -> Outcome:
 def _format_limit(bound: Bound, unit: str) -> str:
     low = [] if bound.min is None else [f"at least {bound.min:.3g}"]
     high = [] if bound.max is None else [f"at most {bound.max:.3g}"]
-    return f"{' and '.join([*low, *high])} {_unit(unit)}".strip()
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit
+    return f"{' and '.join([*low, *high])}{suffix_unit(unit)}".strip()
 
 
 KEPT, UNDETERMINED, BROKEN = 0, 3, 4

@@ -21,7 +21,7 @@ from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.fit import fit_path
-from pipeline.estimation.intervals import Estimate, estimate_path
+from pipeline.estimation.intervals import estimate_path
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, Parameter, is_of_one_run
@@ -177,7 +177,10 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
         common = [
             (index, item)
             for index, item in enumerate(estimates.items)
-            if item.free.label in names and _is_known(item)
+            if item.free.label in names
+            and item.observable
+            and math.isfinite(item.low)
+            and item.deviation > 0.0
         ]
         places = [index for index, _ in common]
         rows = [names.index(item.free.label) for _, item in common]
@@ -225,10 +228,6 @@ def widen(reading: RunReading, labels: Sequence[Label], others: Mapping[str, flo
                 factors[index] = max(abs(away) / deviations / error, 1.0)
     covariance = numbers.covariance * np.outer(factors, factors)
     return replace(reading, numbers=replace(numbers, covariance=covariance))
-
-
-def _is_known(item: Estimate) -> bool:
-    return item.observable and math.isfinite(item.low) and item.deviation > 0.0
 
 
 def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:

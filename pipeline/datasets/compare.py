@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, format_count
+from pipeline.core import FEWEST_OF_SPREAD, format_count, group_by
 from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
@@ -184,7 +184,10 @@ class _Material:
         for name in inputs:
             levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
             groups = _group_levels(levels)
-            overlaps = _find_overlaps(groups, driven[name])
+            overlaps = {
+                frozenset((a.name, b.name)): find_overlap(driven[name][a.name].bins, a.names, b.names)
+                for a, b in itertools.combinations(groups, 2)
+            }
             tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps, driven[name])
             at_equal.append(self._level_datasets(groups, name, driven[name]))
         datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
@@ -327,13 +330,6 @@ def _group_levels(levels: pl.DataFrame) -> list[Group]:
     ]
 
 
-def _find_overlaps(groups: Sequence[Group], driven: Mapping[str, Levelled]) -> dict[frozenset[str], Overlap]:
-    return {
-        frozenset((a.name, b.name)): find_overlap(driven[a.name].bins, a.names, b.names)
-        for a, b in itertools.combinations(groups, 2)
-    }
-
-
 def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[str, frozenset[str]], str]:
     """The effect that carries the difference of two datasets as driven, in words; of diagnosed runs."""
     diagnosed = {run: one for run, one in compared.manifests.items() if can_read(one, "budget")}
@@ -412,10 +408,7 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str
     """Notes on pairs without an answer, once for those alike, and on what intervals of single runs say."""
     if len(groups) < 2:  # noqa: PLR2004 - a pair
         return ["there is one dataset only: nothing to compare it with"] if groups else []
-    silent: dict[str, list[str]] = {}
-    for pair in pairs:
-        if pair.p is None:
-            silent.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
+    silent = group_by((pair.note, f"{pair.a.name} and {pair.b.name}") for pair in pairs if pair.p is None)
     sentences = []
     for note, (first, *others) in sorted(silent.items()):
         count_text = f", and {format_count(len(others), 'more pair')}" if others else ""

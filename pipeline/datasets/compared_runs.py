@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import guess_names, name_first
+from pipeline.core import group_by, guess_names, name_first
 from pipeline.datasets.pooling import (
     ComparisonError,
     add_measures,
@@ -56,6 +56,11 @@ class ComparedRuns:
     notes: tuple[str, ...]
     refusals: Mapping[str, str] = field(default_factory=dict)
     date_notes: tuple[str, ...] = ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Run/generation of every run."""
+        return tuple(f"{run}/{manifest.key}" for run, manifest in sorted(self.manifests.items()))
 
     def scan(self, table: str) -> pl.LazyFrame:
         """Rows of a table of these runs."""
@@ -239,11 +244,11 @@ def _find_slippery(compared: ComparedRuns) -> list[str]:
         .select("run", "input", "suspect", "f_x", "v_x", "transitory")
         .collect()
     )
-    gains: dict[str, list[float]] = {}
-    for (run,), rows in driven.partition_by("run", as_dict=True).items():
-        gain = find_gain_of(rows)
-        if gain is not None:
-            gains.setdefault(sheets[str(run)], []).append(gain)
+    gains = group_by(
+        (sheets[str(run)], gain)
+        for (run,), rows in driven.partition_by("run", as_dict=True).items()
+        if (gain := find_gain_of(rows)) is not None
+    )
     slippery = []
     for run, value in sorted(claimed.items()):
         radius = compared.manifests[run].part("vehicle").get("wheel_radius_m")

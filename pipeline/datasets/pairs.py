@@ -246,7 +246,9 @@ def _compare_family(
             usual = float(units[j].mean() - units[i].mean())
             pair = replace(pair, ratio=exponentiate(difference.value if difference else usual))
         if a.runs and b.runs:
-            pair = replace(pair, p_uncorrected=_ask_published(a, b))
+            # Published work tests over all samples.
+            every = [np.concatenate([run.values for run in group.runs]) for group in (a, b)]
+            pair = replace(pair, p_uncorrected=mann_whitney(*every))
         if test is None or difference is None:
             compared.append(replace(pair, note=NO_SPREAD if unit == RUNS else TOO_SHORT))
             continue
@@ -295,11 +297,6 @@ def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
     """Difference of the medians of two sides, from that of their logarithms and the mean of these."""
     mean, share = float(np.concatenate((a, b)).mean()), b.size / (a.size + b.size)
     return exponentiate(mean + (1.0 - share) * difference) - exponentiate(mean - share * difference)
-
-
-def _ask_published(a: Group, b: Group) -> float:
-    """Test used in published work, over all samples."""
-    return mann_whitney(*(np.concatenate([run.values for run in group.runs]) for group in (a, b)))
 
 
 def _note_scatter(a: Floats, b: Floats) -> list[str]:

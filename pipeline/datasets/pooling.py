@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError
+from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError, group_by
 from pipeline.datasets.rank_tests import Interval
 from pipeline.run import MOVING_MPS
 from pipeline.stages import find_fastest
@@ -394,11 +394,10 @@ def _bound_groups(
 
     low, high, about = names
     bounds: list[tuple[float | None, float | None, str]] = [(None, None, "")] * grouped.height
-    families: dict[tuple[str, str], list[int]] = {}
     rows = grouped.select("vehicle", pl.col("input").cast(pl.String), "only", column).rows(named=True)
-    for index, row in enumerate(rows):
-        if row[column]:
-            families.setdefault((row["vehicle"], row["input"]), []).append(index)
+    families = group_by(
+        ((row["vehicle"], row["input"]), index) for index, row in enumerate(rows) if row[column]
+    )
     for indices in families.values():
         over_runs = bound_levels([np.array(rows[index][column]) for index in indices])
         for index, interval in zip(indices, over_runs, strict=True):

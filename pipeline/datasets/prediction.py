@@ -58,7 +58,7 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
         raise _lack_estimates(compared)
     model = fit_fleet(compared.read_estimates())
     notes = (*compared.notes, *model.notes)
-    return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
+    return FleetModel(model.numbers, model.runs, notes), compared.keys
 
 
 def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame:
@@ -96,10 +96,6 @@ def _find_runs(store: Store, optional: Sequence[str] = (), vehicle: str = "") ->
     )
 
 
-def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
-    return tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
-
-
 def read_fleet(store: Store) -> dict[str, object]:
     """The JSON object of the stored fleet model; its `notes` state whether results have changed since.
 
@@ -123,7 +119,7 @@ def read_fleet(store: Store) -> dict[str, object]:
         raise ComparisonError(
             "no_fleet", "the fleet model cannot be read", where=str(path), hint=hint
         ) from error
-    now = set(_list_keys(_find_runs(store)))
+    now = set(_find_runs(store).keys)
     if now != known:
         notes.append(f"{len(now ^ known)} results have changed since: slip fleet fit brings it up to date")
     return {**content, "notes": notes}
@@ -327,7 +323,9 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         run = runs[choice]
         effects = forecast.draw(which)
         truth = _predict(run, effects)
-        errors = [_measure_gap(truth, side) for side in (known[choice], ideal[choice])]
+        errors = [
+            float(np.sqrt(np.mean(np.abs(truth - side) ** 2))) for side in (known[choice], ideal[choice])
+        ]
         grown = math.exp(size - float(logs[choice]))
         slip = (
             run.ideal
@@ -380,10 +378,6 @@ def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
     """Positions of predictions over 2 s [m], by prediction and time since its start (x + iy)."""
     poses = predict_from(run.run_residuals, effects, Timing()).poses
     return poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
-
-
-def _measure_gap(one: Complex, other: Complex) -> float:
-    return float(np.sqrt(np.mean(np.abs(one - other) ** 2)))
 
 
 def _load_runs(compared: ComparedRuns, forecast: Forecast) -> list[_Driven]:

@@ -237,15 +237,13 @@ def measure_pass_effects(crossings: pl.DataFrame) -> list[PassEffect]:
     Student's t; datasets share the probability of a false finding (Bonferroni).
     """
     groups = [(str(name), rows) for (name,), rows in crossings.group_by("dataset", maintain_order=True)]
-    asked = [(name, _select_repeated(rows)) for name, rows in sorted(groups, key=lambda one: one[0])]
+    asked = [
+        (name, rows.filter(pl.col("slip").is_finite(), pl.len().over(_PLACE) > 1))
+        for name, rows in sorted(groups, key=lambda one: one[0])
+    ]
     able = sum(not _find_lack(rows) for _, rows in asked)
     level = 1.0 - (1.0 - CONFIDENCE) / max(able, 1)
     return [_measure_passes(name, rows, level) for name, rows in asked]
-
-
-def _select_repeated(crossings: pl.DataFrame) -> pl.DataFrame:
-    """Crossings of places that a run crossed several times in one direction."""
-    return crossings.filter(pl.col("slip").is_finite(), pl.len().over(_PLACE) > 1)
 
 
 def _find_lack(rows: pl.DataFrame) -> str:

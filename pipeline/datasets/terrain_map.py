@@ -76,7 +76,9 @@ def read_beside(manifest: Manifest) -> Beside:
         return Beside(reason=error.what)
     start = manifest.part("stages", "extract", "context").get("start_ns")
     begin = start if isinstance(start, int) else index.start_ns
-    fixes = _join([_take_fixes(one, begin) for one in data.topics if find_type(one.type_name).fix], 4)
+    receivers = [_take_fixes(one, begin) for one in data.topics if find_type(one.type_name).fix]
+    # Several receivers are not mixed.
+    fixes = max(receivers, key=len, default=np.zeros((0, 4)))
     reason = "" if fixes.size else "its log has no fixes of satellites"
     return Beside(fixes[:, 0], fixes[:, 1:], reason)
 
@@ -93,11 +95,6 @@ def _list_wanted(index: LogIndex) -> list[Wanted]:
                 kind.fix.status,
             )
     return [Wanted(topic, fields) for topic, fields in wanted.items()]
-
-
-def _join(parts: list[Floats], width: int) -> Floats:
-    """The topic with the most rows: several receivers are not mixed."""
-    return max(parts, key=len, default=np.zeros((0, width)))
 
 
 def _find_times(columns: TopicColumns, start_ns: int) -> Floats:

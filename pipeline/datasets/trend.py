@@ -13,6 +13,7 @@ from pipeline.core import (
     NORMAL_95,
     finite_or_none,
     format_count,
+    group_by,
     guess_names,
     name_first,
     pick,
@@ -579,15 +580,11 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
     notes = []
     if short:
         notes.append(f"too few runs to detect a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
-    needs: dict[str, list[str]] = {}
-    lost: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for number in parameters:
-        if number.undetermined:
-            lost.setdefault((number.vehicle, number.undetermined), []).append(number.label)
-        if number.need:
-            needs.setdefault(f"{number.vehicle}, {format_power(number)}", []).append(number.label)
-        if number.odd:
-            notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
+    lost = group_by(((one.vehicle, one.undetermined), one.label) for one in parameters if one.undetermined)
+    needs = group_by((f"{one.vehicle}, {format_power(one)}", one.label) for one in parameters if one.need)
+    notes += [
+        f"{one.label} of {one.vehicle} stands apart in {', '.join(one.odd)}" for one in parameters if one.odd
+    ]
     notes += [
         f"{', '.join(name_first(labels))} of {vehicle}, left out where a run does not determine it: "
         f"{', '.join(runs)}"

@@ -233,7 +233,7 @@ class Watch:
                         grown = now
                     # The last update need not wait: nothing else runs.
                     is_over = self._log.is_closed or now - grown > self._quiet_s
-                    seen = self._is_behind and (is_over or now >= self._light.due)
+                    seen = self._log.end_s > self.live.duration_s and (is_over or now >= self._light.due)
                     if seen:
                         self._look()
                     try:
@@ -259,11 +259,6 @@ class Watch:
         what = f"nothing was written to it for {self._quiet_s:g} s"
         hint = "Start the recorder, or wait longer with --for SECONDS"
         raise LiveError("never_grows", what, where=str(self.path), hint=hint)
-
-    @property
-    def _is_behind(self) -> bool:
-        """Whether the log has grown since the last light update."""
-        return self._log.end_s > self.live.duration_s
 
     def _look(self) -> None:
         """Light update: run the stages on the end of the log."""

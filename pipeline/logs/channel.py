@@ -315,11 +315,7 @@ class ObjectDecoder:
         kind = max(kinds, key=lambda name: (kinds[name], name == "number"), default="number")
         if kind == "text":
             texts = [[str(value) for value in values if value is not None] for values in lists]
-            offsets = np.r_[0, np.cumsum([len(values) for values in texts], dtype=np.int64)]
-            numbers: dict[str, int] = {}
-            flat_texts = itertools.chain.from_iterable(texts)
-            codes = np.array([numbers.setdefault(v, len(numbers)) for v in flat_texts], dtype=np.int32)
-            column = RaggedStrings(codes, tuple(numbers), offsets)
+            column = RaggedStrings.of_texts(texts)
             return column if several else column.at(0)
         if not several:
             lists = [values or [None] for values in lists]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import Final, TypeAlias, TypeVar
+from typing import Final, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,14 @@ class RaggedStrings:
     codes: NDArray[np.int32]
     values: tuple[str, ...]
     offsets: Offsets
+
+    @classmethod
+    def of_texts(cls, lists: Sequence[Sequence[str]]) -> Self:
+        """The strings of every message as a column."""
+        numbers: dict[str, int] = {}
+        codes = [numbers.setdefault(text, len(numbers)) for texts in lists for text in texts]
+        offsets = np.cumsum([0, *map(len, lists)], dtype=np.int64)
+        return cls(np.array(codes, dtype=np.int32), tuple(numbers), offsets)
 
     def __len__(self) -> int:
         return self.offsets.size - 1

@@ -388,7 +388,7 @@ class ColumnParts:
         values, count = self._values.give_up(), self._counts.give_up()
         texts = () if vocabulary is None else vocabulary.texts()
         if not self._leaf.ragged:
-            values = _take(values, order)
+            values = values if _is_plain(order, values.shape[0]) else values[order]
             return Strings(values.astype(np.int32, copy=False), texts) if self._leaf.text else values
         values, offsets = take_rows(values, count, order)
         if self._leaf.text:
@@ -421,10 +421,6 @@ class _Growing(Generic[Scalar]):
         """Return all values and free the array."""
         values, self._data, self._size = self._data[: self._size], self._nothing, 0
         return values
-
-
-def _take(values: NDArray[np.generic], order: Ints) -> NDArray[np.generic]:
-    return values if _is_plain(order, values.shape[0]) else values[order]
 
 
 def take_rows(values: NDArray[np.generic], counts: Ints, order: Ints) -> tuple[NDArray[np.generic], Ints]:

@@ -16,11 +16,12 @@ import json
 import os
 import struct
 import time
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Final, Protocol, TypeVar
+from typing import BinaryIO, ClassVar, Final, TypeVar
 
 import msgspec
 from mcap.writer import CompressionType, Writer
@@ -79,36 +80,39 @@ class LiveMessage:
     data: bytes
 
 
-class LiveProtocol(Protocol):
-    """Interface of both protocols.
+@dataclass(kw_only=True)
+class LiveProtocol(ABC):
+    """What the clients of both protocols share.
 
     Attributes:
         name: display name.
-        channels: subscribed channels.
+        is_wanted: whether a topic is recorded, by its name and type.
         is_recognized: whether the server has sent a frame that only this protocol has.
         warning: last error reported by the server; empty if there is none.
     """
 
-    name: str
-    is_recognized: bool
-    warning: str
+    name: ClassVar[str]
+    is_wanted: Callable[[str, str], bool]
+    is_recognized: bool = False
+    warning: str = ""
+    _subscribed: dict[Hashable, LiveChannel] = field(default_factory=dict)
 
     @property
     def channels(self) -> list[LiveChannel]:
         """Subscribed channels."""
-        ...
+        return list(self._subscribed.values())
 
+    @abstractmethod
     def ask(self) -> list[str]:
         """Frames that request the server's topics; sent first, and again every few seconds."""
-        ...
 
+    @abstractmethod
     def take(self, frame: str | bytes) -> tuple[list[str], LiveMessage | None]:
         """Process a frame; returns the frames to answer with, and the message in it.
 
         Raises:
             FrameError: it does not conform to the protocol.
         """
-        ...
 
 
 def choose_protocol(
@@ -121,7 +125,9 @@ def choose_protocol(
         is_wanted: whether a topic is recorded, by its name and type.
         given: types by topic as given by the user.
     """
-    return Foxglove(is_wanted) if subprotocol in FOXGLOVE_NAMES else Rosbridge(is_wanted, given)
+    if subprotocol in FOXGLOVE_NAMES:
+        return Foxglove(is_wanted=is_wanted)
+    return Rosbridge(is_wanted=is_wanted, given=given)
 
 
 class _Advertised(msgspec.Struct, rename="camel"):
@@ -143,20 +149,11 @@ class _FoxgloveText(msgspec.Struct, rename="camel"):
     message: object = None
 
 
-@dataclass
-class Foxglove:
+@dataclass(kw_only=True)
+class Foxglove(LiveProtocol):
     """A client of a Foxglove server; a subscription has the id of its channel."""
 
-    is_wanted: Callable[[str, str], bool]
-    name: str = "Foxglove WebSocket"
-    is_recognized: bool = False
-    warning: str = ""
-    _subscribed: dict[int, LiveChannel] = field(default_factory=dict)
-
-    @property
-    def channels(self) -> list[LiveChannel]:
-        """Subscribed channels."""
-        return list(self._subscribed.values())
+    name = "Foxglove WebSocket"
 
     def ask(self) -> list[str]:
         """No frames: the server advertises its topics without a request."""
@@ -232,21 +229,12 @@ class _Topics(msgspec.Struct):
     types: list[str]
 
 
-@dataclass
-class Rosbridge:
+@dataclass(kw_only=True)
+class Rosbridge(LiveProtocol):
     """A client of a rosbridge server; topics come from `/rosapi/topics` or are given with their types."""
 
-    is_wanted: Callable[[str, str], bool]
+    name = "rosbridge"
     given: Mapping[str, str]
-    name: str = "rosbridge"
-    is_recognized: bool = False
-    warning: str = ""
-    _subscribed: dict[str, LiveChannel] = field(default_factory=dict)
-
-    @property
-    def channels(self) -> list[LiveChannel]:
-        """Subscribed channels."""
-        return list(self._subscribed.values())
 
     def ask(self) -> list[str]:
         """Frames that subscribe to the given topics and request the list of topics, which may have grown."""

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, map_in_order, usable_threads
+from pipeline.core import Ints, group_by, map_in_order, usable_threads
 from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
@@ -254,9 +254,7 @@ def _choose_channels(
     jobs: dict[int, _Job] = {}
     schemas = _list_schemas(index)
     types = index.types
-    by_topic: dict[str, list[ChannelInfo]] = {}
-    for info in index.channels:
-        by_topic.setdefault(info.topic, []).append(info)
+    by_topic = group_by((info.topic, info) for info in index.channels)
     for topic, want in _merge_wanted(wanted).items():
         infos = by_topic.get(topic)
         if not infos:

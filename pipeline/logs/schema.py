@@ -473,9 +473,3 @@ def bundled_structure(type_name: str) -> Structure | None:
 def bundled_types() -> tuple[str, ...]:
     """All bundled types as ``package/msg/Name``."""
     return tuple(name.replace("/", "/msg/") for name in _fields())
-
-
-def field_names(type_name: str) -> tuple[str, ...]:
-    """Leaf field paths of a bundled type; empty if it is not bundled."""
-    structure = bundled_structure(type_name)
-    return () if structure is None else tuple(leaf_paths(structure))

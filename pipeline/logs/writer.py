@@ -106,13 +106,8 @@ def _normalize_texts(given: Given, leaf: Leaf, rows: int, *, inside: bool) -> Co
         items, nested = [items] * rows, True
     if len(items) != rows:
         raise ValueError(f"{len(items)} strings for {rows} messages")
-    lists = [_as_list(each) for each in items]
-    numbers: dict[str, int] = {}
-    codes = np.array([numbers.setdefault(t, len(numbers)) for each in lists for t in each], dtype=np.int32)
-    if not leaf.ragged:
-        return Strings(codes, tuple(numbers))
-    offsets = np.r_[0, np.cumsum([len(each) for each in lists], dtype=np.int64)]
-    return RaggedStrings(codes, tuple(numbers), offsets)
+    column = RaggedStrings.of_texts([_as_list(each) for each in items])
+    return column if leaf.ragged else Strings(column.codes, column.values)
 
 
 def _as_list(given: object) -> list[str]:

@@ -111,7 +111,11 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
     values = msgspec.structs.asdict(vehicle)
     known = {} if preset is None else msgspec.structs.asdict(preset)
     # A vehicle of the same name may lack what the preset knows, and a file has no word for that.
-    if preset is not None and vehicle.kind == preset.kind and not _lacks(values, known):
+    if (
+        preset is not None
+        and vehicle.kind == preset.kind
+        and not any(values[key] is None and known[key] is not None for key in RANGES)
+    ):
         lines.append(f"preset = {format_value(preset.id)}")
         return lines + [f"{key} = {_exactly(values[key])}" for key in RANGES if values[key] != known[key]]
     lines += [f"name = {format_value(vehicle.name)}", f"kind = {format_value(vehicle.kind)}"]
@@ -121,11 +125,6 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
         lines.append("# Not known: their values only convert body motion into wheel speeds and back.")
         lines.append(f"stand_ins = [{names}]")
     return lines
-
-
-def _lacks(values: Mapping[str, object], known: Mapping[str, object]) -> bool:
-    """Whether a value of the geometry is unknown that is known."""
-    return any(values[key] is None and known[key] is not None for key in RANGES)
 
 
 def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | None) -> str:

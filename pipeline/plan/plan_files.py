@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from mcap_ros2.writer import Writer
 
-from pipeline.core import Floats, TomlError, format_share, parse_toml, read_bounded_text
+from pipeline.core import Floats, TomlError, format_share, group_by, parse_toml, read_bounded_text
 from pipeline.estimation.terms import SUGGESTION
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
@@ -251,9 +251,7 @@ def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
     still = [
         f"{' or '.join(group.candidates)}: {describe_separation(group)}" for group in diagnosis.undecided
     ]
-    hidden: dict[str, list[str]] = {}
-    for name in diagnosis.unobservable_why:
-        hidden.setdefault(suggest_drive(name), []).append(name)
+    hidden = group_by((suggest_drive(name), name) for name in diagnosis.unobservable_why)
     still += [f"{', '.join(names)}: {advice}" for advice, names in hidden.items()]
     return Check(answers, tuple(still))
 

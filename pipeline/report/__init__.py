@@ -223,11 +223,10 @@ def show_text(value: object) -> object:
     """Make control characters of a text visible; other types and HTML are returned unchanged."""
     if not isinstance(value, str) or value.isprintable() or hasattr(value, "__html__"):
         return value
-    return "".join(_REPLACEMENT if _is_control(mark) else mark for mark in value)
-
-
-def _is_control(mark: str) -> bool:
-    return unicodedata.category(mark).startswith("C") and mark not in "\n\t"
+    return "".join(
+        _REPLACEMENT if mark not in "\n\t" and unicodedata.category(mark).startswith("C") else mark
+        for mark in value
+    )
 
 
 @dataclass(frozen=True)
@@ -302,6 +301,13 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Sequence[str | Cell]] = field(default=())
 
+    def drop_empty(self) -> Table:
+        """The table without the columns in which no row has anything."""
+        nothing = ("", MISSING, Cell(MISSING))
+        some = [i for i in range(len(self.columns)) if any(row[i] not in nothing for row in self.rows)]
+        rows = [[row[i] for i in some] for row in self.rows]
+        return Table(self.caption, [self.columns[i] for i in some], rows)
+
 
 # Catalogue: one offline page over all runs, with sortable columns and a search box.
 #
@@ -327,7 +333,11 @@ def render_catalogue(store: Store) -> str:
     """
     # Reading the manifests of a long season takes time, so they are read only once.
     manifests = store.manifests()
-    links = _list_links(store, manifests)
+    links = {
+        manifest.run: quote((manifest.folder / _REPORT).relative_to(store.root).as_posix())
+        for manifest in manifests
+        if _REPORT in manifest.files
+    }
     # Results may be untrusted: texts may have any length.
     verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
     columns = [
@@ -382,15 +392,6 @@ def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, 
         one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
         facts = facts.join(one, on="run", how="left")
     return runs.join(facts, on="run", how="left").sort("run").to_dicts()
-
-
-def _list_links(store: Store, manifests: Sequence[Manifest]) -> Mapping[str, str]:
-    """Relative address of the report of each run that has one."""
-    return {
-        manifest.run: quote((manifest.folder / _REPORT).relative_to(store.root).as_posix())
-        for manifest in manifests
-        if _REPORT in manifest.files
-    }
 
 
 def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:

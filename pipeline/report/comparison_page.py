@@ -7,7 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration
+from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration, group_by, number_in
 from pipeline.datasets import (
     ABOUT_BLOCKS,
     ABOUT_UNIT,
@@ -41,10 +41,9 @@ from pipeline.report import (
     write_page,
 )
 from pipeline.report.page import add_figures, render_figures
-from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis, stack
 from pipeline.store import Store
-from pipeline.words import Line, PairLine, list_pairs, list_shown_notes, title_line
+from pipeline.words import PairLine, list_pairs, list_shown_notes, title_line
 from pipeline.words.comparison import list_lines
 
 _ROW_HEIGHT = 34
@@ -353,9 +352,7 @@ def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
 
 def _list_answers(answer: Answer) -> list[dict[str, object]]:
     """The answer's lines under what they are about."""
-    answers: dict[str, list[Line]] = {}
-    for line in list_lines(answer):
-        answers.setdefault(title_line(line), []).append(line)
+    answers = group_by((title_line(line), line) for line in list_lines(answer))
     return [{"title": title, "input": lines[0].input, "lines": lines} for title, lines in answers.items()]
 
 
@@ -422,8 +419,7 @@ def _tabulate_pair_ratios(pairs: Sequence[PairLine], caption: str) -> Table:
         ]
         for pair in pairs
     ]
-    columns = [i for i in range(len(_RATIOS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
-    return Table(caption, [_RATIOS[i] for i in columns], [[row[i] for i in columns] for row in rows])
+    return Table(caption, _RATIOS, rows).drop_empty()
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
@@ -442,10 +438,7 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
     ]
     caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; every run has the same weight"
     # Columns without any value, not computed or not in the logs, are omitted.
-    columns = [
-        i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)
-    ]
-    return Table(caption, [_DATASETS[i] for i in columns], [[row[i] for i in columns] for row in rows])
+    return Table(caption, _DATASETS, rows).drop_empty()
 
 
 def _tabulate_pairs(view: View) -> Table | None:
@@ -478,7 +471,8 @@ def _format_p(p: float | None) -> str:
 
 
 def _format_ends(row: Mapping[str, object]) -> str:
-    return format_ends(row).replace(" ", "\u00a0") or MISSING
+    low, high = number_in(row, "low"), number_in(row, "high")
+    return MISSING if low is None else f"{format_number(low)}\u00a0to\u00a0{format_number(high)}"
 
 
 def tabulate_difficulty(shown: pl.DataFrame) -> Table:

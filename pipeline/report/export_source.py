@@ -143,12 +143,6 @@ class ExportSource:
             known |= set(frame["input"].cast(pl.String).unique())
         return [name for name in INPUTS if name in known]
 
-    @property
-    def length_scale_m(self) -> float:
-        """Length scale L of the moduli [m]."""
-        scale = self.manifest.part("configuration", "slip").get("length_scale_m")
-        return float(scale) if isinstance(scale, int | float) else 1.0
-
     @cached_property
     def shift_ns(self) -> int:
         """Offset from stamps to the recorder's clock [ns].
@@ -169,6 +163,17 @@ class ExportSource:
             for frame in self.batches(table, ("t", "stamp")):
                 return int(frame["stamp"][0]) - round(float(frame["t"][0]) * 1e9)
         return 0
+
+    def stamp(self, seconds: Floats) -> Ints:
+        """Stamps [ns] of times since the start of the run [s]."""
+        stamps: Ints = self.start_ns + np.round(seconds * 1e9).astype(np.int64)
+        return stamps
+
+    def thin_velocities(self, columns: Sequence[str], most: int) -> pl.DataFrame:
+        """About so many rows of the velocities, evenly chosen; empty if the run has none."""
+        every = max((self.manifest.count_rows("velocities") or 0) // most, 1)
+        parts = [frame.gather_every(every) for frame in self.batches("velocities", columns)]
+        return pl.concat(parts) if parts else pl.DataFrame()
 
     def log_times(self, stamps: np.ndarray) -> np.ndarray:
         """Stamps [ns] on the recorder's clock."""
@@ -404,7 +409,7 @@ def write_findings(writer: LogWriter, source: ExportSource, track: pl.DataFrame)
     for frame in source.batches("findings"):
         rows = frame.sort(pl.col("t_start").fill_null(0.0), maintain_order=True)
         seconds = rows["t_start"].fill_null(0.0).to_numpy()
-        stamps = source.start_ns + np.round(seconds * 1e9).astype(np.int64)
+        stamps = source.stamp(seconds)
         severities = rows["severity"].cast(pl.String).to_list()
         writer.write_columns(
             FINDINGS,
@@ -451,14 +456,9 @@ def _write_texts(
 
 def join_track(source: ExportSource) -> pl.DataFrame:
     """Thinned ``stamp segment x y z modulus``, by segment and time; the modulus is null without slip."""
-    if "velocities" not in source.manifest.tables:
-        return pl.DataFrame()
-    every = max(source.manifest.tables["velocities"].rows // _MOST_POINTS, 1)
-    wanted = ("stamp", "segment", "x", "y", "z")
-    parts = [frame.gather_every(every) for frame in source.batches("velocities", wanted)]
-    if not parts:
-        return pl.DataFrame()
-    track = pl.concat(parts)
+    track = source.thin_velocities(("stamp", "segment", "x", "y", "z"), _MOST_POINTS)
+    if track.is_empty():
+        return track
     leading = source.inputs[0] if source.inputs else ""
     places = track.select("stamp", "segment")
     known = [

@@ -15,6 +15,7 @@ from pipeline.core import (
     FigureFormat,
     format_count,
     format_share,
+    group_by,
     mapping_in,
     number_in,
     objects_in,
@@ -89,10 +90,9 @@ def render_fleet(content: Mapping[str, object]) -> str:
     """
     rows = objects_in(content, "parameters")
     runs = mapping_in(content, "runs")
-    reasons: dict[str, list[str]] = {}
-    for row in rows:
-        if row["level"] is None:
-            reasons.setdefault(f"{row['because']} ({row['vehicle']})", []).append(_label(row))
+    reasons = group_by(
+        (f"{row['because']} ({row['vehicle']})", _label(row)) for row in rows if row["level"] is None
+    )
     vehicles = []
     for number, name in enumerate(runs):
         own = [row for row in rows if row["vehicle"] == name]
@@ -126,9 +126,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
 
 
 def _tabulate_levels(caption: str, parameters: Sequence[Mapping[str, object]]) -> Table:
-    rows = [_list(row) for row in parameters]
-    columns = [i for i in range(len(_LEVELS)) if any(row[i] for row in rows)]
-    return Table(caption, [_LEVELS[i] for i in columns], [[row[i] for i in columns] for row in rows])
+    return Table(caption, _LEVELS, [_list(row) for row in parameters]).drop_empty()
 
 
 def _label(row: Mapping[str, object]) -> str:

@@ -66,13 +66,13 @@ class MotionStage:
 
     Args:
         data: the runs; the first one is shown.
-        places: measured ``t x y`` of that run in the map as starts of predicted paths; None keeps the
+        velocities: that table of the run, whose places are the starts of predicted paths; None keeps the
             coordinates of the plane of motion.
     """
 
-    def __init__(self, data: EstimationData, places: pl.DataFrame | None = None) -> None:
+    def __init__(self, data: EstimationData, velocities: pl.DataFrame | None = None) -> None:
         self.data = data
-        self._places = places
+        self._places = None if velocities is None else velocities.select("t", "x", "y").sort("t")
         self._run_residuals = data.residuals_by_run[0]
 
     @cached_property
@@ -210,5 +210,4 @@ def view_diagnosis(
         # A log with too little data for a model still has its slip.
         return None
     state = ModelState(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
-    places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
-    return MotionStage(data, places).view(state, diagnosis.ladder, diagnosis.noise_floor)
+    return MotionStage(data, tables.get("velocities")).view(state, diagnosis.ladder, diagnosis.noise_floor)

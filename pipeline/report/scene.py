@@ -9,7 +9,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import mapping_in, number_in, objects_in
-from pipeline.report import format_number
 from pipeline.report.motion_view import MotionView
 from pipeline.report.theme import round_up, usual_ends
 from pipeline.results import Named, RunDiagnosis, find_refusal, is_small, read_findings, split_main
@@ -126,14 +125,6 @@ class RunReport:
     def items(self, key: str) -> list[Mapping[str, object]]:
         """List of objects in the summary; empty if missing."""
         return objects_in(self.summary, key)
-
-
-def format_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
-    """Format an interval from its ``low`` to its ``high``; empty without one."""
-    low, high = number_in(source, "low"), number_in(source, "high")
-    return (
-        "" if low is None else f"{format_number(low, digits=digits)} to {format_number(high, digits=digits)}"
-    )
 
 
 _BIN = "_bin"

@@ -40,7 +40,7 @@ from pipeline.report.export_source import (
     write_trail,
 )
 from pipeline.stages import find_residual_modulus
-from pipeline.store import replace_file, temporary_beside
+from pipeline.store import read_length_scale, replace_file, temporary_beside
 from schemas import contract_of
 
 _BODY = "base_link"
@@ -134,7 +134,7 @@ def _write_model(
     columns = {f"v_{axis}": predicted.velocity[:, i] for i, axis in enumerate("xyw")}
     velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
     _write_twist(writer, source, MODEL, velocity, "v")
-    modulus = find_residual_modulus(predicted.velocity, frame, length=source.length_scale_m)
+    modulus = find_residual_modulus(predicted.velocity, frame, length=read_length_scale(source.manifest))
     known = np.isfinite(modulus)
     times = source.log_times(frame["stamp"].to_numpy()[known])
     writer.write_columns(RESIDUAL, "std_msgs/msg/Float64", times, {"data": modulus[known]})
@@ -155,7 +155,7 @@ def _write_predicted_poses(
     """Write the poses of consecutive predictions, which begin at measured poses."""
     times = prediction.start_times[:, None] + prediction.horizon_times[None, :]
     rows = np.broadcast_to(prediction.horizon_times < _FOLLOWED_S, times.shape)
-    stamps = source.start_ns + np.round(times[rows] * 1e9).astype(np.int64)
+    stamps = source.stamp(times[rows])
     x, y, yaw = prediction.poses[rows].T
     fields: dict[str, Given] = {
         "pose.position.x": x,
@@ -177,15 +177,10 @@ def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -
 
 def _write_path(writer: LogWriter, source: ExportSource) -> None:
     """Write the complete path as one message at its beginning, thinned to screen resolution."""
-    if "velocities" not in source.manifest.tables:
+    rows = source.thin_velocities(("stamp", "x", "y", "z", "yaw"), _PATH_POSES)
+    if rows.is_empty():
         return
-    every = max(source.manifest.tables["velocities"].rows // _PATH_POSES, 1)
-    parts = [
-        frame.gather_every(every) for frame in source.batches("velocities", ("stamp", "x", "y", "z", "yaw"))
-    ]
-    if not parts:
-        return
-    whole = {name: column.to_numpy()[None, :] for name, column in pl.concat(parts).to_dict().items()}
+    whole = {name: column.to_numpy()[None, :] for name, column in rows.to_dict().items()}
     stamps, yaw = whole.pop("stamp"), whole.pop("yaw")
     _write_poses_along(writer, source, PATH, stamps, whole, yaw)
 
@@ -196,7 +191,7 @@ def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Pred
         return
     slot = np.floor(prediction.start_times * _PREDICTIONS_HZ)
     rows = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
-    stamps = source.start_ns + np.round(prediction.start_times[rows] * 1e9).astype(np.int64)
+    stamps = source.stamp(prediction.start_times[rows])
     along = stamps[:, None] + np.round(prediction.horizon_times * 1e9).astype(np.int64)[None, :]
     x, y, yaw = np.moveaxis(prediction.poses[rows], 2, 0)
     _write_poses_along(writer, source, PREDICTED_PATH, along, {"x": x, "y": y}, yaw)

@@ -295,16 +295,12 @@ class Mirror:
             if isinstance(error, OSError) and error.errno in _OF_THE_DISK:
                 with name_disk_errors(self.store.root):
                     raise
-            raise self._unreachable(error) from error
-
-    def _unreachable(self, error: Exception) -> StoreError:
-        return StoreError(
-            "store_unreachable",
-            f"the store of the results refuses a request: {' '.join(str(error).split())}",
-            where=self.address,
-            hint="Check the network, the bucket, your rights to it and your credentials (AWS_PROFILE, "
-            "AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL), then run the same command again",
-        )
+            what = f"the store of the results refuses a request: {' '.join(str(error).split())}"
+            hint = (
+                "Check the network, the bucket, your rights to it and your credentials (AWS_PROFILE, "
+                "AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL), then run the same command again"
+            )
+            raise StoreError("store_unreachable", what, where=self.address, hint=hint) from error
 
 
 def _is_index(name: str) -> bool:

@@ -11,7 +11,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
-from pipeline.core import TOO_LARGE, PathError, SlipError, may_lead_out, resolve_inside
+from pipeline.core import TOO_LARGE, PathError, SlipError, group_by, may_lead_out, resolve_inside
 
 
 class StoreError(SlipError):
@@ -388,10 +388,11 @@ def date_runs(starts: Mapping[str, int | None]) -> RunDates:
     clocks = {run: _read_clock(start) for run, start in starts.items()}
     refused = {starts[run] for run, clock in clocks.items() if _contradicts(named[run], clock)}
     days = {run: named[run] or (None if starts[run] in refused else clocks[run]) for run in starts}
-    shared: dict[tuple[int | None, str | None], list[str]] = {}
-    for run, start in starts.items():
-        if clocks[run] is not None:
-            shared.setdefault((start, None if start in refused else days[run]), []).append(run)
+    shared = group_by(
+        ((start, None if start in refused else days[run]), run)
+        for run, start in starts.items()
+        if clocks[run] is not None
+    )
     alone = [f"{runs[0]} ({clocks[runs[0]]})" for (start, _), runs in shared.items()
              if start in refused and len(runs) == 1]  # fmt: skip
     notes = [

@@ -275,18 +275,6 @@ _ENTRANCES = ("/", "/live")
 """Pages that the token in the address opens."""
 
 
-def _welcome(path: str) -> HTMLResponse:
-    """The answer to an entrance with the token, which opens the page by a second request.
-
-    This removes the token from the address, and the browser treats later requests as same-site, wherever the
-    link was. The script preserves the selected run.
-    """
-    return HTMLResponse(
-        f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url={path}"></noscript>'
-        '<script src="/enter.js"></script></head><body></body></html>'
-    )
-
-
 def make_token() -> str:
     """A random token."""
     return secrets.token_urlsafe(32)
@@ -347,7 +335,12 @@ class Guard:
         cookie = f"slip-{scope['server'][1]}"
         path, given = scope["path"], QueryParams(scope["query_string"]).get("token", "")
         if path in _ENTRANCES and self._is_token(given):
-            welcome = _welcome(path)
+            # The page is opened by a second request: that removes the token from the address, and the browser
+            # treats later requests as same-site, wherever the link was. The script keeps the selected run.
+            welcome = HTMLResponse(
+                f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url={path}"></noscript>'
+                '<script src="/enter.js"></script></head><body></body></html>'
+            )
             welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
             welcome.set_cookie(f"{cookie}-pages", self._page_token, httponly=True, samesite="lax")
             return welcome

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from pipeline import results
-from pipeline.core import Floats
+from pipeline.core import Floats, Newest
 from pipeline.estimation import (
     Errors,
     Estimates,
@@ -120,8 +119,8 @@ class PreparedRun:
     data: EstimationData
     stage: MotionStage
     lock: threading.RLock = field(default_factory=threading.RLock)
-    _fits: OrderedDict[object, Judged] = field(default_factory=OrderedDict)
-    _errors: OrderedDict[object, Errors] = field(default_factory=OrderedDict)
+    _fits: Newest[Judged] = field(default_factory=lambda: Newest(_MOST_FITS))
+    _errors: Newest[Errors] = field(default_factory=lambda: Newest(_MOST_FITS))
     _second: EstimationData | None = None
 
     def judge(self, model: Model) -> Judged:
@@ -129,21 +128,18 @@ class PreparedRun:
 
         Effects at neutral values are fitted by a search; the others start from their present values.
         """
-        key = model.effects
+
+        def fit() -> Judged:
+            fitted, held_out = fit_and_hold_out(self.data, model)
+            return Judged(fitted, held_out, estimate_intervals(fitted) if model.effects else NOTHING)
+
         with self.lock:
-            if key not in self._fits:
-                fitted, held_out = fit_and_hold_out(self.data, model)
-                estimates = estimate_intervals(fitted) if model.effects else NOTHING
-                self.remember(model, Judged(fitted, held_out, estimates))
-            self._fits.move_to_end(key)
-            return self._fits[key]
+            return self._fits.recall(model.effects, fit)
 
     def remember(self, model: Model, judged: Judged) -> None:
         """Cache the fit of a model; callers also cache it for the model as written to its file."""
         with self.lock:
-            self._fits[model.effects] = judged
-            while len(self._fits) > _MOST_FITS:
-                self._fits.popitem(last=False)
+            self._fits.keep(model.effects, judged)
 
     def apportion(self, model: Model, length_scale_m: float) -> Sequence[SlipBudget]:
         """Budgets by cause of a model, after fitting it; empty for the ideal model."""
@@ -165,15 +161,11 @@ class PreparedRun:
 
     def measure_errors(self, model: Model) -> Errors:
         """Held-out errors of a model, fitted as `judge` does; without intervals."""
-        key = model.effects
         with self.lock:
-            if key in self._fits:
-                return self._fits[key].errors
-            if key not in self._errors:
-                self._errors[key] = fit_and_hold_out(self.data, model)[1].pooled
-                while len(self._errors) > _MOST_FITS:
-                    self._errors.popitem(last=False)
-            return self._errors[key]
+            known = self._fits.find(model.effects)
+            if known is not None:
+                return known.errors
+            return self._errors.recall(model.effects, lambda: fit_and_hold_out(self.data, model)[1].pooled)
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model with its present values: held out where a fit gave these, else as they are."""
@@ -183,7 +175,7 @@ class PreparedRun:
 
     def find_fit(self, model: Model) -> Judged | None:
         """The known fit that gave a model its present values; None if none did."""
-        known = self._fits.get(model.effects)
+        known = self._fits.find(model.effects)
         return known if known is not None and _list_keys(known.fitted.model) == _list_keys(model) else None
 
     def state(self, model: Model, timing: Sequence[float]) -> ModelState:
@@ -242,8 +234,8 @@ class RunCache:
     """Cache of the most recently opened runs."""
 
     def __init__(self) -> None:
-        self._prepared: OrderedDict[tuple[str, str, str], PreparedRun] = OrderedDict()
-        self._runs: OrderedDict[tuple[str, str], tuple[Vehicle, MotionRun]] = OrderedDict()
+        self._prepared = Newest[PreparedRun](_MOST_RUNS)
+        self._runs = Newest[tuple[Vehicle, MotionRun]](_MOST_RUNS)
         self._lock = threading.Lock()
         self._making: dict[tuple[str, str, str], threading.Lock] = {}
 
@@ -251,15 +243,13 @@ class RunCache:
         """The vehicle and the run as arrays; cached."""
         key = (manifest.run, manifest.key)
         with self._lock:
-            if key in self._runs:
-                return self._runs[key]
+            known = self._runs.find(key)
+        if known is not None:
+            return known
         vehicle = load_vehicle(manifest)
         loaded = (vehicle, load_motion_run(manifest, vehicle))
         with self._lock:
-            self._runs[key] = loaded
-            while len(self._runs) > _MOST_RUNS:
-                self._runs.popitem(last=False)
-        return loaded
+            return self._runs.keep(key, loaded)
 
     def list_inputs(self, manifest: Manifest) -> list[str]:
         """Available inputs for models of a run, the default first."""
@@ -281,19 +271,14 @@ class RunCache:
             making = self._making.setdefault(key, threading.Lock())
         with making:
             with self._lock:
-                if key in self._prepared:
-                    self._prepared.move_to_end(key)
-                    return self._prepared[key]
+                known = self._prepared.find(key)
+            if known is not None:
+                return known
             data = EstimationData([run], vehicle, chosen)
-            places = None
-            if "velocities" in manifest.tables:
-                places = manifest.read("velocities").select(pl.col("t", "x", "y")).sort("t")
-            prepared = PreparedRun(manifest, vehicle, run, data, MotionStage(data, places))
+            velocities = manifest.read("velocities") if "velocities" in manifest.tables else None
+            prepared = PreparedRun(manifest, vehicle, run, data, MotionStage(data, velocities))
             with self._lock:
-                self._prepared[key] = prepared
-                while len(self._prepared) > _MOST_RUNS:
-                    self._prepared.popitem(last=False)
-            return prepared
+                return self._prepared.keep(key, prepared)
 
 
 def _list_keys(model: Model) -> list[object]:

@@ -1,13 +1,12 @@
 """State and logic of the server: results, prepared runs, sessions, trials of effects, and jobs."""
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline.core import SlipError
+from pipeline.core import Newest, SlipError
 from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
 from pipeline.models import Effect, FormulaEffect, Model, write_model
@@ -206,7 +205,7 @@ class Sessions:
         self.jobs = jobs
         self._cache = RunCache()
         self._trials = Trials()
-        self._figures: OrderedDict[tuple[str, str], FigureCache] = OrderedDict()
+        self._figures = Newest[FigureCache](_MOST_ALBUMS)
         self._lock = threading.Lock()
 
     def answer(self, ask: Ask) -> dict[str, object]:
@@ -290,9 +289,11 @@ class Sessions:
         def make() -> Effect:
             return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)
 
+        named = {effect.id for effect in editor.diagnosed}
         changes: dict[str, Callable[[], Session]] = {
             "open": lambda: session,
-            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway or self._is_named(editor, ask)),
+            # The diagnosis tested its effects together with all others.
+            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway or ask.effect in named),
             "add_named": lambda: self._add_named(editor, ask),
             "add_found": lambda: self._add_suggestion(editor, ask),
             "formula": lambda: editor.add_effect(make(), anyway=ask.anyway),
@@ -312,10 +313,6 @@ class Sessions:
         diagnosis = read_diagnosis(self.results, prepared.manifest)
         formula = () if diagnosis is None else read_suggestion(diagnosis, prepared.vehicle)
         return Editor(file, prepared, session, (*_list_named(diagnosis), *formula))
-
-    def _is_named(self, editor: Editor, ask: Ask) -> bool:
-        """Whether the diagnosis tested an effect together with all others."""
-        return ask.effect in {effect.id for effect in editor.diagnosed}
 
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
         diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
@@ -386,14 +383,8 @@ class Sessions:
             return how(self._figures_of(prepared.manifest), _view(file, prepared, session))
 
     def _figures_of(self, manifest: Manifest) -> FigureCache:
-        key = (manifest.run, manifest.key)
         with self._lock:
-            if key not in self._figures:
-                self._figures[key] = FigureCache(manifest)
-                while len(self._figures) > _MOST_ALBUMS:
-                    self._figures.popitem(last=False)
-            self._figures.move_to_end(key)
-            return self._figures[key]
+            return self._figures.recall((manifest.run, manifest.key), lambda: FigureCache(manifest))
 
 
 def _view(file: SessionFile, prepared: PreparedRun, session: Session) -> Shown:

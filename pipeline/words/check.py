@@ -11,6 +11,7 @@ from pipeline.core import (
     format_angle,
     format_length,
     format_share,
+    group_by,
     make_plain,
     split_interval,
     suffix_unit,
@@ -342,9 +343,7 @@ def _name_outcome(check: Check, name: str) -> str:
 
 def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
     """Names of the quantities of which no change is shown, a line for each outcome."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(_name_outcome(check, name), []).append(name)
+    groups = group_by((_name_outcome(check, name), name) for name in names)
     outcomes: dict[str, set[str]] = {}
     for name in check.changes:
         outcomes.setdefault(name.partition(".")[0], set()).add(
@@ -385,7 +384,10 @@ def _list_details(check: Check, name: str) -> list[str]:
     change = check.changes[name]
     within = f" ({_format_p(change.p_within)} within the recordings)" if change.status == "differs" else ""
     first = f"{name}  {_format_p(change.p)}{within}"
-    show = _format_ratio if name in LOGARITHMS else _format_size
+
+    def show(size: float) -> str:
+        return f"a factor of {math.exp(size):.2g}" if name in LOGARITHMS else f"{size:.2g}"
+
     text = f"detectable change {show(change.smallest)}"
     text += "; errors scaled to the speed of AFTER" if name in ERRORS else ""
     if not check.simulated:
@@ -399,14 +401,6 @@ def _list_details(check: Check, name: str) -> list[str]:
 def _format_p(p: float, digits: int = 2) -> str:
     """`p = 0.012`; below 0.0001 only that, as the tails of the test are not known better."""
     return f"p = {p:.{digits}g}" if p >= _LEAST_P else f"p < {_LEAST_P:g}"
-
-
-def _format_ratio(logarithm: float) -> str:
-    return f"a factor of {math.exp(logarithm):.2g}"
-
-
-def _format_size(value: float) -> str:
-    return f"{value:.2g}"
 
 
 def _list_readings(check: Check) -> list[str]:

@@ -11,6 +11,7 @@ from pipeline.core import (
     format_angle,
     format_part,
     format_share,
+    group_by,
     mark_finding,
     round_digits,
     suffix_unit,
@@ -335,10 +336,10 @@ def _format_effect(
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
     shared = _list_shared(effect)
     yield from _describe_numbers(effect.id, shared, parts, _format_values(effect, shared), width)
-    where: dict[str, list[str]] = {}
-    for name, numbers in zip(run.joint, effect.by_run, strict=False):
-        own = {key: value for key, value in numbers.items() if key in effect.own}
-        where.setdefault(format_numbers(own), []).append(name)
+    where = group_by(
+        (format_numbers({key: value for key, value in numbers.items() if key in effect.own}), name)
+        for name, numbers in zip(run.joint, effect.by_run, strict=False)
+    )
     for text, names in where.items():
         if text:
             others = f" and {len(names) - 1} more" if len(names) > 1 else ""
@@ -603,16 +604,14 @@ def _format_of_runs(by_text: Mapping[str, Sequence[str]], asked: int) -> str:
 
 def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, Finding, str]]:
     """Severity, first and text of every finding: incidents of one kind are one, and so are repeated ones."""
-    incidents: dict[str, list[Finding]] = {}
-    for one in findings:
-        if one.severity != "info" and one.t_start is not None and one.t_end is not None:
-            incidents.setdefault(one.id, []).append(one)
+    incidents = group_by(
+        (one.id, one)
+        for one in findings
+        if one.severity != "info" and one.t_start is not None and one.t_end is not None
+    )
     timed = [(alike[0].severity, alike[0], _format_timed(alike)) for alike in incidents.values()]
     joined = {one for alike in incidents.values() for one in map(id, alike)}
-    plain: dict[tuple[str, str], list[Finding]] = {}
-    for one in findings:
-        if id(one) not in joined:
-            plain.setdefault((one.severity, one.text), []).append(one)
+    plain = group_by(((one.severity, one.text), one) for one in findings if id(one) not in joined)
     return timed + [
         (severity, alike[0], f"{text} ({len(alike)} times)" if len(alike) > 1 else text)
         for (severity, text), alike in plain.items()

@@ -12,6 +12,7 @@ from pipeline.core import (
     format_errors,
     format_length,
     format_share,
+    group_by,
 )
 from pipeline.results import (
     ABOVE_FLOOR,
@@ -92,10 +93,7 @@ def describe_region(region: Region) -> str:
 
 def describe_regions(regions: Sequence[Region]) -> list[str]:
     """Regions with their shares of the time and of each error; one region of several errors is said once."""
-    alike: dict[tuple[str, tuple[float, ...]], list[Region]] = {}
-    for region in regions:
-        if region.id:
-            alike.setdefault((region.id, region.limits), []).append(region)
+    alike = group_by(((region.id, region.limits), region) for region in regions if region.id)
     return [
         f"{name_region(ones[0])} ({format_share(ones[0].time_share, 0)} of the time): {_join_shares(ones)}"
         for ones in alike.values()

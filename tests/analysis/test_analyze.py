@@ -1,12 +1,12 @@
 """One log through all stages: what is computed, what is reused, what is left behind."""
 
-import hashlib
 import json
 import shutil
 from pathlib import Path
 
 import polars as pl
 import pytest
+from stored import hash_tree
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log, update_datasets
@@ -30,14 +30,6 @@ def out(tmp_path: Path) -> Path:
 
 def analyze(log: Path, out: Path, **options: object) -> Outcome:
     return analyze_log(log, Options(out=out, **{"report": False, **options}))
-
-
-def hash_tree(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def test_a_log_becomes_tables_a_summary_and_a_report(log: Path, out: Path) -> None:

@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import msgspec
 import pytest
 from batch_tools import batch
+from verbs import slip
 
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 
@@ -17,7 +18,6 @@ from pathlib import Path
 import fsspec
 
 from pipeline.batch.batch_work import Ledger
-from pipeline.cli import main
 from pipeline.logs import LogError, open_store
 from pipeline.store import LOG_NOTES, Store
 from pipeline.store.checksums import encode_manifest
@@ -79,12 +79,6 @@ def name_address(out: Path, address: str) -> None:
     for entry in Ledger(store).read_all().values():
         forged_entry = replace(entry, state="failed", log=replace(entry.log, path=address))
         store.notes(LOG_NOTES).write(address, msgspec.to_builtins(forged_entry))
-
-
-def slip(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    return int(ended.value.code or 0)
 
 
 @pytest.mark.long

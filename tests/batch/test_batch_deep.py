@@ -1,38 +1,24 @@
 """Folders nested 1,500 levels deep, among results and logs: one line says where, all else is done."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 from batch_tools import batch, counts
+from verbs import ask_verb, run_slip
 
 from pipeline.batch import Pruning
-from pipeline.cli import main
 from pipeline.store import Store
 
 
-def ask(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    said = capsys.readouterr()
-    assert "Traceback" not in said.err
-    return int(ended.value.code or 0), said.out + said.err
-
-
-def test_deep_results_cost_one_line(
-    season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], dig: Callable[..., None]
-) -> None:
+def test_deep_results_cost_one_line(season: Path, tmp_path: Path, dig: Callable[..., None]) -> None:
     out = tmp_path / "out"
     batch(season / "a.mcap", out)
     dig(out / "runs")
-    code, said = ask(capsys, "results", "status", out)
+    code, said, told = run_slip("results", "status", out)
     assert code == 1
     assert "done          1" in said
-    assert said.count("levels of folders deep") == 1
-    code, said = ask(capsys, "results", "verify", out, "--json")
-    assert code == 1
-    found = json.loads(said)
+    assert (said + told).count("levels of folders deep") == 1
+    found = ask_verb("results", "verify", out, code=1)
     assert found["runs"] == 1
     assert [problem["code"] for problem in found["files"]] == ["left_out"]
     assert found["files"][0]["path"].startswith(str(out / "runs" / "d"))

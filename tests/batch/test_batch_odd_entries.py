@@ -1,6 +1,5 @@
 """One bad entry never stops a season."""
 
-import json
 import os
 import shutil
 import threading
@@ -10,9 +9,9 @@ from pathlib import Path
 import damage_season
 import pytest
 from damage_season import KINDS, NO_TEXT, cut_in_future, run_batch
+from verbs import ask_verb, run_slip
 
 from pipeline.batch.recordings import find_recordings
-from pipeline.cli import main
 from pipeline.logs import LogError, open_log, spell_location, to_location
 from pipeline.store import Store
 
@@ -116,9 +115,7 @@ def odd(season: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(season / "a.mcap", folder / f"{NO_TEXT}.mcap"))
 
 
-def test_a_name_that_is_no_text_passes_through_everything(
-    odd: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_is_no_text_passes_through_everything(odd: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     code, found, _ = run_batch(odd.parent, out)
     assert (code, [line["path"] for line in found["logs"]]) == (0, [str(odd)])  # type: ignore[attr-defined]
@@ -143,14 +140,10 @@ def test_a_name_that_is_no_text_passes_through_everything(
         ["results", "explain", str(odd)],
         ["batch", str(odd)],
     ):
-        with pytest.raises(SystemExit) as caught:
-            main([*arguments, "--out", str(out)])
-        seen = capsys.readouterr()
-        assert caught.value.code == 0, seen.err
-        (seen.out + seen.err).encode()
-    with pytest.raises(SystemExit) as caught:
-        main(["inspect", str(odd), "--json"])
-    assert json.loads(capsys.readouterr().out)["path"] == str(odd)
+        code, said, told = run_slip(*arguments, "--out", out)
+        assert code == 0, told
+        (said + told).encode()
+    assert ask_verb("inspect", odd)["path"] == str(odd)
 
 
 def test_a_path_of_any_bytes_is_a_text_that_leads_back() -> None:

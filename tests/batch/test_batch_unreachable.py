@@ -4,6 +4,7 @@ import socket
 import time
 
 import pytest
+from verbs import run_slip
 
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 
@@ -12,7 +13,6 @@ from pathlib import Path
 
 import fsspec
 
-from pipeline.cli import main
 from pipeline.logs import remote as bucket_room
 
 LOG = "s3://nobody/logs/a.mcap"
@@ -42,12 +42,10 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     fsspec.get_filesystem_class("s3").clear_instance_cache()
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+def run(*arguments: str) -> str:
     """What a verb that fails says."""
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    said = capsys.readouterr().err
-    assert caught.value.code == 1, said
+    code, _, said = run_slip(*arguments)
+    assert code == 1, said
     lines = [line for line in said.splitlines() if line.startswith("slip: ")]
     assert len(lines) == 1, said
     assert "Traceback" not in said
@@ -55,14 +53,12 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_without_credentials(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "Unable to locate credentials" in run(capsys, *VERBS[verb])
+def test_without_credentials(verb: str) -> None:
+    assert "Unable to locate credentials" in run(*VERBS[verb])
 
 
 @pytest.mark.parametrize("verb", ["batch", "inspect", "query"])
-def test_without_anybody_at_the_address(
-    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_anybody_at_the_address(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as place:
         place.bind(("127.0.0.1", 0))
         port = place.getsockname()[1]
@@ -70,13 +66,11 @@ def test_without_anybody_at_the_address(
         monkeypatch.setenv(f"AWS_{name}", value)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
     monkeypatch.setattr(bucket_room, "_ATTEMPTS", 1)
-    assert f"127.0.0.1:{port}" in run(capsys, *VERBS[verb])
+    assert f"127.0.0.1:{port}" in run(*VERBS[verb])
 
 
 @pytest.mark.parametrize("verb", ["batch", "query"])
-def test_a_store_that_is_silent_does_not_hold_anybody(
-    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_is_silent_does_not_hold_anybody(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bucket_room, "_ANSWER_S", 0.2)
     monkeypatch.setattr(bucket_room, "_ATTEMPTS", 1)
     with socket.create_server(("127.0.0.1", 0)) as place:
@@ -84,6 +78,6 @@ def test_a_store_that_is_silent_does_not_hold_anybody(
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", "a")
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
         started = time.monotonic()
-        said = run(capsys, *VERBS[verb])
+        said = run(*VERBS[verb])
     assert time.monotonic() - started < 10.0
     assert "imeout" in said

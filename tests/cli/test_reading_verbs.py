@@ -1,38 +1,21 @@
 """Verbs that read stored runs leave them as they are, and say what contradicts them."""
 
-import hashlib
 import itertools
 import json
 import shutil
 from pathlib import Path
 
 import pytest
-from verbs import ask_verb, print_verb, run_verb
+from stored import hash_tree
+from verbs import ask_verb, print_verb, run_verb, slip
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.cli import main
 from pipeline.estimation import Diagnosis, diagnose_runs
 from pipeline.store import Store
 from pipeline.store.checksums import decode_checked, encode_checked
 
 ERRORS = ("t_mrmse_m", "r_mrmse_rad")
-
-
-def slip(*arguments: object) -> int:
-    """Run the program in this process; its exit code."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    return int(ended.value.code or 0)
-
-
-def hash_tree(folder: Path) -> dict[str, str]:
-    """Hash of every file below a folder, by its path."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.mark.parametrize("name", ["field/wide.mcap", "field/wide"])

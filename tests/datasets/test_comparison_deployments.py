@@ -1,12 +1,11 @@
 """The table of deployments and the map."""
 
-import json
 from pathlib import Path
 
 import polars as pl
 import pytest
+from verbs import ask_verb, run_slip
 
-from pipeline.cli import main
 from pipeline.datasets import ComparisonError
 from pipeline.datasets.deployments import find_own_table, rate_name, read_deployments
 from schemas import FEATURES
@@ -68,14 +67,10 @@ def test_what_breaks_the_schema_is_refused_with_its_reason(
         read_deployments(table)
 
 
-def test_the_map_needs_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(["fleet", "map", str(tmp_path / "none"), "--json"])
-    assert left.value.code == 1
-    assert "there are no results" in capsys.readouterr().err
+def test_the_map_needs_no_results(tmp_path: Path) -> None:
+    code, _, said = run_slip("fleet", "map", tmp_path / "none", "--json")
+    assert code == 1
+    assert "there are no results" in said
     assert not (tmp_path / "none").exists()
     (tmp_path / "none").mkdir()
-    with pytest.raises(SystemExit) as ended:
-        main(["fleet", "map", str(tmp_path / "none"), "--json"])
-    assert ended.value.code == 0
-    assert len(json.loads(capsys.readouterr().out)["deployments"]) == 20
+    assert len(ask_verb("fleet", "map", tmp_path / "none")["deployments"]) == 20

@@ -1,13 +1,11 @@
 """A fleet of public recordings whose answers are published: a robot that drives straight on four floors."""
 
-import json
 import shutil
 import string
 from pathlib import Path
 
 import pytest
-
-from pipeline.cli import main
+from verbs import ask_verb, print_verb
 
 FLOORS = Path(__file__).parents[3] / "shared/published/robotino_surfaces"
 KNOWN = {"table": 0.892, "gray": 0.720, "green": 0.447}
@@ -30,39 +28,30 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
             (folder / floor / letter).mkdir()
             shutil.copy(log, folder / floor / letter / f"run-{floor}-{letter}.mcap")
     out = folder / "results"
-    with pytest.raises(SystemExit) as ended:
-        main(["batch", "run", str(folder), "--diagnosis", "--results", str(out), "--quiet"])
-    assert ended.value.code == 0
+    print_verb("batch", "run", folder, "--diagnosis", "--results", out, "--quiet")
     return out
 
 
-def ask(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, object]:
-    with pytest.raises(SystemExit) as ended:
-        main([*words, "--json"])
-    assert ended.value.code == 0
-    return json.loads(capsys.readouterr().out)  # type: ignore[no-any-return]
-
-
 @pytest.mark.long
-def test_four_floors_are_told_apart_as_published(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fleet = ask(capsys, "fleet", "fit", str(results))
-    (gain,) = (one for one in fleet["parameters"] if one["effect"] == "wheel_radius")  # type: ignore[attr-defined]
+def test_four_floors_are_told_apart_as_published(results: Path) -> None:
+    fleet = ask_verb("fleet", "fit", str(results))
+    (gain,) = (one for one in fleet["parameters"] if one["effect"] == "wheel_radius")
     assert gain["level"] == "terrain"
     assert gain["name"] == "longitudinal_slip"
     means = {floor: mean["value"] for floor, mean in gain["terrains"].items()}
     assert sorted(means, key=means.__getitem__) == ["green", "gray", "table"]
     for floor, known in KNOWN.items():
         assert means[floor] == pytest.approx(known, abs=0.06), floor
-    notes = "\n".join(fleet["notes"])  # type: ignore[arg-type]
+    notes = "\n".join(fleet["notes"])
     assert "wheel_radius_wrong" not in notes
     assert "left out, too short to be diagnosed alone (12 runs): " in notes
-    assert sum(map(len, fleet["runs"].values())) == 36  # type: ignore[attr-defined]
+    assert sum(map(len, fleet["runs"].values())) == 36
 
 
 @pytest.mark.long
-def test_no_run_on_a_slippery_floor_is_left_out(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    compared = ask(capsys, "compare", str(results))
-    rows = sorted(compared["datasets"], key=lambda row: row["median_modulus"])  # type: ignore[call-overload]
+def test_no_run_on_a_slippery_floor_is_left_out(results: Path) -> None:
+    compared = ask_verb("compare", str(results))
+    rows = sorted(compared["datasets"], key=lambda row: row["median_modulus"])
     assert [row["terrain"] for row in rows] == ["table", "brown", "gray", "green"]
     assert [row["runs"] for row in rows] == [12] * 4
-    assert all(pair["p_adjusted"] <= 0.05 for pair in compared["pairs"])  # type: ignore[attr-defined]
+    assert all(pair["p_adjusted"] <= 0.05 for pair in compared["pairs"])

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from verbs import ask_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.cli import main
 from pipeline.datasets.trend import follow_trend
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
@@ -55,26 +55,11 @@ def test_the_table_of_parameters_is_the_diagnosis(three: Path) -> None:
         assert not table["at_bound"].any()
 
 
-def test_a_track_that_changed_raises_the_alert(three: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    codes = {}
-    for limit in ("2.0", "1.7"):
-        with pytest.raises(SystemExit) as ended:
-            main(
-                [
-                    "fleet",
-                    "trend",
-                    str(three),
-                    "--by",
-                    "vehicle",
-                    "--limit",
-                    f"effective_track.k={limit}",
-                    "--json",
-                ]
-            )
-        codes[limit] = ended.value.code
-    found = json.loads(capsys.readouterr().out.split("\n}\n")[1] + "\n}")
+def test_a_track_that_changed_raises_the_alert(three: Path) -> None:
+    words = ("fleet", "trend", three, "--by", "vehicle", "--limit")
+    ask_verb(*words, "effective_track.k=2.0")
+    found = ask_verb(*words, "effective_track.k=1.7", code=4)
 
-    assert codes == {"2.0": 0, "1.7": 4}
     (alert,) = found["alerts"]
     assert alert["quantity"] == QUANTITY
     assert "yard/2026-05-03, above the limit of 1.7" in alert["text"]

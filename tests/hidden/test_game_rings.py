@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import hashlib
 import json
 import math
 import re
@@ -25,6 +24,7 @@ from game.rings import MIX, list_names, make_truth
 from game.score import measure_scores, read_truths, score_ring
 from injections import list_injections
 from mcap.reader import make_reader
+from stored import hash_tree
 from test_injections import DRIVE, tables  # noqa: F401 - a fixture
 
 from pipeline.core import SlipError
@@ -49,14 +49,6 @@ def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("game")
     assert len(make(folder)) == TASKS
     return folder
-
-
-def hash_tree(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.mark.long

@@ -466,7 +466,7 @@ def test_a_killed_watch_goes_on_in_the_same_folder(source: Path, tmp_path: Path)
 )
 def test_no_frame_of_a_foxglove_server_does_more_than_to_be_left_out(frame: str | bytes) -> None:
     with pytest.raises(FrameError):
-        Foxglove(lambda *_: True).take(frame)
+        Foxglove(is_wanted=lambda *_: True).take(frame)
 
 
 @pytest.mark.parametrize(
@@ -481,7 +481,7 @@ def test_no_frame_of_a_foxglove_server_does_more_than_to_be_left_out(frame: str 
 )
 def test_no_frame_of_a_rosbridge_server_does_more_than_to_be_left_out(frame: str | bytes) -> None:
     with pytest.raises(FrameError):
-        Rosbridge(lambda *_: True, {"/a": "b"}).take(frame)
+        Rosbridge(is_wanted=lambda *_: True, given={"/a": "b"}).take(frame)
 
 
 @pytest.mark.long

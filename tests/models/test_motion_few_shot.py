@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
-from verbs import run_slip
+from verbs import run_slip, run_verb
 
-from pipeline.cli import main
 from pipeline.estimation import EstimationData, Fitted, Input, estimate_intervals, fit_model, score
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.models import Model, find_effect, read_model
@@ -110,8 +109,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if arguments[0] == "analyze" and number == 3:
                 continue
             out = log if arguments[0] == "simulate" else folder / "results"
-            with pytest.raises(SystemExit):
-                main([*arguments, "--out", str(out)])
+            run_verb(*arguments, "--out", out)
     return folder
 
 

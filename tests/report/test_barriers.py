@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from barriers import find_barriers
 from chrome import LAPTOP, PHONE, Chrome
+from verbs import print_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.cli import main
 from pipeline.report import CATALOGUE, read_own, render_catalogue, theme, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
@@ -47,13 +47,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         simulate_case("husky_tile", out=log, seed=number + 1, duration_s=60.0)
         analyze_log(log, Options(out=results, diagnosis=number == 0, overrides={"run": {"terrain": terrain}}))
     for verb in ("compare", "fleet trend", "fleet map"):
-        with pytest.raises(SystemExit) as ended:
-            main([*verb.split(), str(results), "--quiet"])
-        assert ended.value.code == 0
-    plan = ["plan", "--vehicle", "husky_a200", "--time", "120s", "--out", str(folder / "plan"), "--quiet"]
-    with pytest.raises(SystemExit) as ended:
-        main(plan)
-    assert ended.value.code == 0
+        print_verb(*verb.split(), results, "--quiet")
+    print_verb("plan", "--vehicle", "husky_a200", "--time", "120s", "--out", folder / "plan", "--quiet")
     write_page(Store(results), CATALOGUE, render_catalogue(Store(results)))
     return {
         "report": next(results.glob("runs/*/tile_0/*/report.html")),

@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from pipeline.logs import bundled_types, field_names
+from pipeline.logs import bundled_types
+from pipeline.logs.schema import bundled_structure, leaf_paths
 from pipeline.sources import ConfigurationError, Signal, convert_unit, find_preset
 from pipeline.sources.message_types import MessageType, find_type, list_types
 
@@ -45,7 +46,9 @@ def list_paths(kind: MessageType) -> list[str]:
 
 @pytest.mark.parametrize("name", [name for name in KNOWN if name in BUNDLED])
 def test_every_field_is_one_of_the_type(name: str) -> None:
-    leaves = field_names(name)
+    structure = bundled_structure(name)
+    assert structure is not None
+    leaves = list(leaf_paths(structure))
     indexed = re.compile(r"\[\d+\]$")
     paths = [path for each in list_paths(find_type(name)) for path in Signal("", each).fields()]
     wrong = [path for path in paths if indexed.sub("", path) not in leaves]

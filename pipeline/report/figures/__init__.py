@@ -231,7 +231,7 @@ def before_and_after(input_name: str) -> Channel:
     return encode_column("series:N", scale=scale, legend=legend)
 
 
-def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
+def slip_colour(scene: Scene) -> Channel:
     """Colour ramp of slip modulus, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
     legend = {
@@ -247,7 +247,7 @@ def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
         "clamp": True,
         "interpolate": "rgb",
     }
-    return encode_column(f"{field}:Q", scale=scale, legend=legend)
+    return encode_column("modulus:Q", scale=scale, legend=legend)
 
 
 def brush_over_time() -> dict[str, object]:
