@@ -472,7 +472,6 @@ def _format_change(fit: datasets.ModelFit, refusals: Mapping[str, str]) -> list[
 
 
 def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-
     lines = list(words.format_heads("held-out error of"))
     for name, item in rows:
         lines.append(words.format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))

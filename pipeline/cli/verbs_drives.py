@@ -208,7 +208,6 @@ def _gather(
 
 
 def _find_vehicle(name: str | None) -> sources.Vehicle:
-
     vehicle = None if name is None else sources.find_preset(name)
     if vehicle is None:
         known = ", ".join(preset.id for preset in sources.list_presets())

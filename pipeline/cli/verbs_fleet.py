@@ -178,7 +178,6 @@ def _open_runs(
 
 
 def _render(checked: datasets.Check, to: Literal["markdown", "junit"]) -> str:
-
     return {"markdown": words.format_markdown, "junit": words.format_junit}[to](checked)
 
 
@@ -349,7 +348,6 @@ def predict(
 
 
 def _format_forecast(content: Mapping[str, object]) -> list[str]:
-
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{format_count(cast('int', here), 'run')} there, {elsewhere} elsewhere"
     lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
@@ -458,7 +456,6 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _format_trend(followed: datasets.Trend, page: Path) -> list[str]:
-
     quiet = datasets.format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
     # The notes list the parameters that could not be judged.

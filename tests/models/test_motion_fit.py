@@ -294,7 +294,7 @@ def test_the_interval_of_a_threshold_ends_where_it_can_be_no_smaller() -> None:
 
 @pytest.mark.long
 def test_intervals_of_forty_seconds_hold_the_truth() -> None:
-    """The track is told by the few seconds that turn: 95 % of 300, less two and a half standard deviations."""
+    """The track is told by the few seconds that turn: 95 % of 300, less 2.4 standard deviations."""
     held = 0
     for seed in range(300):
         track = float(np.random.default_rng(seed).uniform(1.3, 2.2))
