@@ -43,6 +43,7 @@ from pipeline.stages.drive import (
 )
 from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.findings import Finding, StageError, blame_damage
+from pipeline.stages.lost_messages import fill_gaps
 from pipeline.stages.pose_topics import Cut, read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.tilt import lean
@@ -636,6 +637,8 @@ class Extraction:
         frame = pl.DataFrame(
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
+        if section.interpolate:
+            frame = fill_gaps(frame)
         if section.ignore:
             frame = self._leave_out(frame, section.ignore, held=held)
         return frame.with_columns(
