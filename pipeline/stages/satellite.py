@@ -271,8 +271,8 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
         )
     share = float(np.mean(~np.isfinite(yaw)))
     text = (
-        f"the heading of {topic} is its course over ground, since no IMU that turns with it was "
-        f"recorded or agrees: lateral slip is not observable and reads zero, and turns are smoothed over "
+        f"the heading of {topic} is its course over ground, since no sensor that turns with it "
+        f"was recorded or agrees: lateral slip is not observable and reads zero, and turns are smoothed over "
         f"{_WINDOW_S:g} s, which makes those that change faster look smaller"
     )
     if share:
@@ -341,7 +341,7 @@ def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Flo
 def locate_vehicle(
     receiver: Receiver,
     beside: Receiver | None,
-    imu: Receiver | None,
+    turnings: Sequence[Turning],
     ahead: tuple[Floats, Floats] | None,
     lever: Floats,
 ) -> Located:
@@ -350,7 +350,7 @@ def locate_vehicle(
     Args:
         receiver: fixes, or velocities over ground if there are none.
         beside: velocities that belong to the fixes.
-        imu: gyro, and attitude if available.
+        turnings: sensors that turn with the vehicle.
         ahead: times [s] and forward speed [m/s] of the wheels or the command.
         lever: position of the antenna in base_link [m], shape (3,).
     """
@@ -376,7 +376,7 @@ def locate_vehicle(
     if ahead is None:
         text = f"neither wheels nor commands show when the vehicle of {topic} reversed: forward is assumed"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
-    heading = find_heading(times, course, [] if imu is None else list_turnings(imu), lever[:2], topic)
+    heading = find_heading(times, course, turnings, lever[:2], topic)
     headed = np.isfinite(heading.yaw)
     quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
     arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
@@ -446,6 +446,16 @@ def list_turnings(imu: Receiver) -> list[Turning]:
     return turnings
 
 
+def read_headings(number: Receiver, field: str) -> list[Turning]:
+    """A number that may be a heading, in radians and in degrees: the course tells which, and its sense."""
+    values, times = reading.numbers(number.columns, field)[number.order], number.times[number.order]
+    known = np.isfinite(values)
+    if known.sum() < reading.FEWEST_MESSAGES:
+        return []
+    name, angles = number.columns.topic, (values[known], np.radians(values[known]))
+    return [Turning(name, times[known], np.unwrap(angle)) for angle in angles]
+
+
 def is_new(times: Floats, position: Floats) -> Flags:
     """Whether a position is new: one repeated while the antenna moves comes from a slow receiver."""
     if times.size < 2:  # noqa: PLR2004 - one position is new
@@ -461,14 +471,14 @@ def is_new(times: Floats, position: Floats) -> Flags:
 
 
 def head_positions(
-    arrays: PoseArrays, receiver: Receiver, imu: Receiver | None, ahead: tuple[Floats, Floats] | None
+    arrays: PoseArrays, receiver: Receiver, turnings: Sequence[Turning], ahead: tuple[Floats, Floats] | None
 ) -> Located | None:
     """Poses of a position-only topic, with the course as heading, or a gyro aligned with the course.
 
     Args:
         arrays: poses of all messages.
         receiver: the topic with its clock.
-        imu: gyro, and attitude if available.
+        turnings: sensors that turn with the vehicle.
         ahead: times [s] and forward speed [m/s] of the wheels or the command.
 
     Returns:
@@ -480,7 +490,6 @@ def head_positions(
     )
     rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
     times, position = receiver.times[rows], arrays.position[rows]
-    turnings = [] if imu is None else list_turnings(imu)
     heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
     headed = np.isfinite(heading.yaw)
     if headed.sum() < FEWEST_MESSAGES:

@@ -15,7 +15,7 @@ from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
 from pipeline.simulate.sensors import to_earth
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver
-from pipeline.stages.satellite import locate_vehicle, read_over_ground, to_local_plane
+from pipeline.stages.satellite import list_turnings, locate_vehicle, read_over_ground, to_local_plane
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 SKIDDING = replace(
@@ -127,7 +127,7 @@ def receive(change: Callable[[dict[str, np.ndarray]], object]) -> Receiver:
     ids=["a status below zero", "zero and zero", "no number", "beyond the pole"],
 )
 def test_what_is_no_fix_is_left_out_and_counted(change: Callable[..., object], lost: int) -> None:
-    made = locate_vehicle(receive(change), None, None, None, np.zeros(3))
+    made = locate_vehicle(receive(change), None, [], None, np.zeros(3))
     (said,) = [finding for finding in made.findings if finding.id == "no_fix"]
     assert said.count == lost
     assert made.rows.size == 300 - lost
@@ -136,7 +136,7 @@ def test_what_is_no_fix_is_left_out_and_counted(change: Callable[..., object], l
 
 def test_an_altitude_that_is_not_known_moves_nothing_sideways() -> None:
     made = locate_vehicle(
-        receive(lambda fields: fields["altitude"].fill(np.nan)), None, None, None, np.zeros(3)
+        receive(lambda fields: fields["altitude"].fill(np.nan)), None, [], None, np.zeros(3)
     )
     moved = np.diff(made.arrays.position[:, :2], axis=0)
     np.testing.assert_allclose(moved, 0.2, rtol=1e-3)
@@ -151,7 +151,9 @@ def test_a_log_with_hardly_a_fix_has_no_pose_and_no_crash(count: int) -> None:
     few = replace(whole, order=whole.order[:count])
     stamps = whole.columns.log_time[:0]
     silent = TopicColumns("/imu", 2, "sensor_msgs/msg/Imu", stamps, stamps, stamps, {}, ())
-    made = locate_vehicle(few, None, Receiver(silent, np.zeros(0), whole.order[:0]), None, np.zeros(3))
+    made = locate_vehicle(
+        few, None, list_turnings(Receiver(silent, np.zeros(0), whole.order[:0])), None, np.zeros(3)
+    )
     assert made.rows.size == (count if count == 30 else 0)
     assert made.arrays.position.shape == (made.rows.size, 3)
 
