@@ -65,7 +65,7 @@ def resolve_losses(case: Case, command: Candidate | None) -> None:
         text += ", and the base did not get them: it follows the last one that is recorded"
     elif not section.interpolate:
         text += (
-            ". The last one is held, for nothing tells whether the base got them: if it did, a lag of the "
+            ". The last one is held, for no signal shows whether the base got them: if it did, a lag of the "
             f"drive is up to {1e3 * period * share / (1.0 - share):.0f} ms longer than found"
         )
     case.findings.append(Finding("commands_lost", "warning", text, where="command", value=share))

@@ -267,10 +267,10 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
     if first is None or made is None or first.reading.form != "body" or any(one.is_sure for one in drives):
         return
     asked = first.reading.columns(motion.steps, made.lag, made.delay, crossed=False)[0]
-    place = np.append(0.0, np.cumsum(motion.body * np.exp(1j * (np.cumsum(motion.yaw) - motion.yaw))))
+    positions = np.append(0.0, np.cumsum(motion.body * np.exp(1j * (np.cumsum(motion.yaw) - motion.yaw))))
     rows = np.append(np.flatnonzero(np.diff(motion.steps.start // _FAR_S, prepend=-1.0)), asked.size)
     moved, expected = (
-        float(np.abs(np.diff(one[rows])).sum()) for one in (place, np.append(0.0, np.cumsum(asked)))
+        float(np.abs(np.diff(one[rows])).sum()) for one in (positions, np.append(0.0, np.cumsum(asked)))
     )
     is_unlike = max(made.shares) < _UNLIKE and made.blocks.size >= _FEWEST_BLOCKS
     if not is_unlike or moved < _GOES * expected:

@@ -524,8 +524,8 @@ def head_positions(
     )
     rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
     times, position = receiver.times[rows], arrays.position[rows]
-    course, alone = (follow(times, position, ahead) for follow in (follow_track, follow_closely))
-    heading = find_heading(times, course, turnings, np.zeros(2), topic, alone)
+    course, closely = (follow(times, position, ahead) for follow in (follow_track, follow_closely))
+    heading = find_heading(times, course, turnings, np.zeros(2), topic, closely)
     headed = np.isfinite(heading.yaw)
     if headed.sum() < FEWEST_MESSAGES:
         return None
