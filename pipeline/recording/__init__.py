@@ -53,6 +53,7 @@ FAULTS = (
     "command_reversed",
     "command_of_map",
     "commands_mixed",
+    "not_driven",
     "motor_reversed",
     "wheels_reversed",
     "wheel_dead",

@@ -117,6 +117,10 @@ class Case:
         self.driven: Explained | None = None
         # Whether what is commanded has a unit, so that the controller's lengths can be told from it.
         self.is_scaled = True
+        # Whether the body hardly moves where the drive does.
+        self.is_still = False
+        # Whether the base stops before the next command, by which its gain is not known.
+        self.in_bursts = False
 
     def leave_out(self, source: DriveSource) -> None:
         """Take a candidate for no role."""

@@ -11,6 +11,7 @@ from pipeline.recording.command_scale import measure_command
 from pipeline.recording.encoders import report_dead, resolve_wheels
 from pipeline.recording.evidence import equal_motion
 from pipeline.recording.geometry import Geometry, Length, explain_wheels, measure_lengths, roll_wheels
+from pipeline.recording.losses import resolve_losses
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, measure_motion
 from pipeline.recording.outages import leave_out
 from pipeline.recording.publishers import resolve_publishers
@@ -22,6 +23,7 @@ from pipeline.recording.roles import (
     leave_out_steered,
     name_sources,
     read_drives,
+    report_stranger,
     report_turn,
     resolve_stamps,
 )
@@ -82,6 +84,7 @@ class Recording:
         evidence: on every signal that was tried.
         alignment: corrections of the command; None where nothing shows them.
         cut: the poses, cut into segments; None where they were not read.
+        is_still: whether the body hardly moves where the drive does.
     """
 
     sources: Sources
@@ -92,12 +95,13 @@ class Recording:
     evidence: tuple[Evidence, ...] = ()
     alignment: Alignment | None = None
     cut: Cut | None = None
+    is_still: bool = False
 
     @property
     def is_followed(self) -> bool:
         """Whether the pose follows what drives the vehicle, as far as the log tells."""
         known = [one for one in self.evidence if one.margin is not None and one.role != "gyro"]
-        return not known or self.margin > CLEAR
+        return not self.is_still and (not known or self.margin > CLEAR)
 
     @property
     def margin(self) -> float:
@@ -124,11 +128,13 @@ def examine(given: Given) -> Recording:
     gyros = [] if gyro is None else [gyro]
     readings = [*(drive.reading for drive in drives), *gyros]
     motion = turn_motion(case, motion, readings)
+    report_stranger(case, drives, motion)
     command, wheels = choose_roles(case, drives)
     report_axes(case, command)
     report_speed_alone(case, (command, wheels))
     resolve_stamps(case, command)
     command = resolve_publishers(case, command, wheels)
+    resolve_losses(case, command)
     resolve_timeout(case, command, wheels, motion)
     report_turn(case, command)
     motion = resolve_lengths(case, motion, readings, command, wheels)
@@ -162,6 +168,7 @@ def examine(given: Given) -> Recording:
         + tuple(describe(one, roles) for one in gyros),
         alignment,
         case.extraction.cut,
+        case.is_still,
     )
 
 
@@ -249,6 +256,7 @@ def _stand_in(case: Case) -> Recording | None:
             wheels.reading, motion = reading, rolled
             for one in commands:
                 one.reading.explain(rolled)
+    resolve_losses(case, command)
     resolve_timeout(case, command, wheels, motion)
     if wheels.reading.form == "sides":
         report_dead(case, wheels, "the log holds no pose in its rank")

@@ -271,7 +271,7 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
     ):
         radius, track = measure_controller(case.driven)
         speed, rate = case.command_factors()
-        radius = _scale(radius, speed * case.wheel_factor())
+        radius = made.rolled if case.in_bursts else _scale(radius, speed * case.wheel_factor())
         made = replace(made, radius=radius, track=_scale(track, speed / rate))
     changes = case.changes.get("command" if sides is command else "wheels", {})
     return replace(made, is_taken="scale" in changes or changes.get("unit") in RIMS)

@@ -156,7 +156,8 @@ def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]
 
 def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | None, Candidate | None]:
     """Command and wheels: those by type and name, unless the motion says otherwise."""
-    if _is_still(case, drives):
+    case.is_still = _is_still(case, drives)
+    if case.is_still:
         for one in drives:
             one.reading.explained = None
     sure = [one for one in drives if one.is_sure and not one.reading.is_constant]
@@ -247,6 +248,38 @@ def _is_still(case: Case, drives: Sequence[Candidate]) -> bool:
     fits = [made.ahead, made.turned, *([made.aside[0]] if made.aside is not None else [])]
     gains = max(abs(float(one.gains[0])) for one in fits)
     return gains < least and max(made.shares) < _EXPLAINED
+
+
+_GOES = 0.3
+"""Way of a body over that of its command from which on it moves: wheels that spin move it less."""
+_UNLIKE = 0.5
+"""Share of a motion, its half, that a command explains where it is followed: of another body .29 at most."""
+_FAR_S = 2.0
+"""Time [s] of a way: over it the noise of poses is small beside a motion."""
+_FEWEST_BLOCKS = 12
+"""Least number of blocks of the motion, a minute: in less a body that is driven may not show it."""
+
+
+def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> None:
+    """Tell poses that move otherwise than all that is commanded or measured, as those of another body."""
+    first = _find(drives, case.sources.command)
+    made = None if first is None else first.reading.explained
+    if first is None or made is None or first.reading.form != "body" or any(one.is_sure for one in drives):
+        return
+    asked = first.reading.columns(motion.steps, made.lag, made.delay, crossed=False)[0]
+    positions = np.append(0.0, np.cumsum(motion.body * np.exp(1j * (np.cumsum(motion.yaw) - motion.yaw))))
+    rows = np.append(np.flatnonzero(np.diff(motion.steps.start // _FAR_S, prepend=-1.0)), asked.size)
+    moved, expected = (
+        float(np.abs(np.diff(one[rows])).sum()) for one in (positions, np.append(0.0, np.cumsum(asked)))
+    )
+    is_unlike = max(made.shares) < _UNLIKE and made.blocks.size >= _FEWEST_BLOCKS
+    if not is_unlike or moved < _GOES * expected:
+        return
+    text = (
+        f"the poses of {case.sources.pose} move {moved:.3g} m, but not as {first.source} commands: they are "
+        "of another body, or something else drives it ([pose] and [command] in run.toml name others)"
+    )
+    case.findings.append(Finding("not_driven", "error", text, where="pose", value=moved))
 
 
 def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:

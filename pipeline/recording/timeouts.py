@@ -86,11 +86,43 @@ def resolve_timeout(case: Case, command: Candidate | None, wheels: Candidate | N
     timeout = timeout or bursts
     if timeout is None:
         return
+    if bursts is not None:
+        case.in_bursts = True
+        timeout = _take_as_fast(command.reading, bursts, motion)
     hold_s = case.configuration.command.hold_s or timeout.seconds
     case.changes.setdefault("command", {})["hold_s"] = hold_s
     case.findings.append(_report(timeout, hold_s, in_bursts=bursts is not None))
     command.reading = hold(command.reading, hold_s)
     command.reading.explain(motion)
+
+
+_GAINS = (0.8, 1.25)
+"""Gains that another time-out may explain: those of a drive whose commands have the unit of its motion."""
+
+
+def _take_as_fast(reading: Reading, bursts: CommandTimeout, motion: Motion) -> CommandTimeout:
+    """The time-out with which the body moves as far as commanded, unless a gain is too large for that.
+
+    A burst is as long as the time-out and as fast as a gain: their product alone is well known.
+    """
+    held = hold(reading, bursts.seconds)
+    made, first = held.explain(motion), held.first
+    if reading.form != "body" or made is None or first is None or reading.first is None:
+        return bursts
+    times, values = reading.first.times, np.abs(reading.first.values)
+    held_s = np.minimum(np.diff(times, append=np.inf), bursts.seconds)
+    # Bursts that are cut into cells of the grid are longer or shorter than they are.
+    longer = float(np.abs(first.grid).sum()) * GRID_S / max(float(values @ held_s), 1e-9)
+    # Over whole blocks a lag that is not quite right is none.
+    block, steps = made.motion.steps.block, made.motion.steps
+    ways = (held.columns(steps, made.lag, made.delay, crossed=False)[0], made.motion.body.real)
+    asked, moved = (np.bincount(block, weights=one) for one in ways)
+    gain = float(asked @ moved) / max(float(asked @ asked), 1e-9) * longer
+    if not _GAINS[0] < gain < _GAINS[1]:
+        return bursts
+    seconds = gain * bursts.seconds
+    low, high = min(bursts.low, seconds), max(bursts.high, seconds)
+    return CommandTimeout(seconds, low, high, bursts.silences)
 
 
 def _report(timeout: CommandTimeout, hold_s: float, *, in_bursts: bool) -> Finding:
@@ -100,7 +132,10 @@ def _report(timeout: CommandTimeout, hold_s: float, *, in_bursts: bool) -> Findi
         held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
     text = f"the base begins to stop {said} after the last command (from {timeout.silences} pauses): {held}"
     if in_bursts:
-        text += "; commands are rarer than that, so that it drives in bursts: send them more often"
+        text += (
+            "; commands are rarer than that, so that it drives in bursts: send them more often. It is taken "
+            "to be as fast as commanded in them: gains of the drive are not known from such a log"
+        )
     return Finding(
         "command_timeout",
         "warning" if in_bursts else "info",
@@ -146,9 +181,12 @@ def find_timeout(reading: Reading, motion: Motion, lever: float) -> CommandTimeo
     return CommandTimeout(seconds, low, high, len(silences))
 
 
-_HOLDS_S = np.array([0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0])
-"""Times [s] for which bases hold a command, .25 to 1 s by their documentation."""
-_PARTS = 8
+_HOLDS_S = np.array(
+    [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0]
+)
+"""Times [s] for which bases hold a command, .25 to 1 s by their documentation, each near enough to the next
+that one between them is likelier than none."""
+_PARTS = 4
 """Parts into which the intervals beside the likeliest of them are divided: of a hundredth of a second."""
 _FEWEST_WAITS = 10
 """Least number of waits between live commands, each of which ends a motion that is known from its start."""
@@ -191,12 +229,13 @@ def find_hold(reading: Reading, motion: Motion) -> CommandTimeout | None:
     if not blocks:
         return None
     best = max(blocks, key=lambda seconds: float(blocks[seconds].sum()))
-    if compare(blocks[best], made.blocks) < CLEAR:
-        return None
     at = int(np.searchsorted(_HOLDS_S, best))
     ends = _HOLDS_S[[max(at - 1, 0), min(at + 1, _HOLDS_S.size - 1)]]
     for one in np.linspace(ends[0], ends[1], 2 * _PARTS + 1).tolist():
         blocks.setdefault(one, rate(one))
+    best = max(blocks, key=lambda seconds: float(blocks[seconds].sum()))
+    if compare(blocks[best], made.blocks) < CLEAR:
+        return None
     tried, nats = np.array(sorted((one, float(each.sum())) for one, each in blocks.items())).T
     likely = tried[nats > nats.max() - _NATS]
     step = float(np.ptp(ends)) / (2 * _PARTS)

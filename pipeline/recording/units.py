@@ -175,6 +175,11 @@ def _find_speed_units(case: Case, command: Candidate, wheels: Candidate) -> None
         _report_units(case, role, one, Units((units.likeliest[index], ""), rival), (gains[index],))
 
 
+_FASTEST = 1.3
+"""Most that a body moves of what is commanded: wheels slip, and their radii are off by a quarter. More is a
+scale, as of commands from -1 to 1."""
+
+
 def _report_units(
     case: Case, role: str, drive: Candidate, units: Units, gains: Sequence[float | None] = (None, None)
 ) -> None:
@@ -187,6 +192,9 @@ def _report_units(
         unit, of = units.likeliest[index], f"the {what} of {drive.source}"
         if getattr(section, key) is not None or not unit:
             continue
+        is_too_fast = key == "unit" and drive.reading.form == "body" and (gains[0] or 0.0) > _FASTEST
+        if unit in USUAL and is_too_fast and not (case.is_known and case.driven):
+            case.is_scaled = False
         if unit not in USUAL:
             speed, gain = units.likeliest[0], gains[0]
             is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)

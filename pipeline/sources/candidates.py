@@ -105,6 +105,7 @@ class PoseSource:
         frames: parent and child among the transforms.
         content: content of the topic.
         velocity: topic with the velocities over ground that belong to a fix.
+        headings: numbers that may be the heading of positions alone.
         name: of the body, if a message contains the poses of several.
         fields: the fields of the pose, if the configuration names them.
         wheels: the measured wheels whose motion stands in for a pose; None of a recorded pose.
@@ -116,6 +117,7 @@ class PoseSource:
     frames: tuple[str, str] | None = None
     content: PoseContent = PoseContent.POSE
     velocity: str = ""
+    headings: tuple[Signal, ...] = ()
     name: str = ""
     fields: PoseFields | None = None
     wheels: DriveSource | None = None
@@ -185,7 +187,9 @@ class Sources:
         signals = [signal for one in drives if one is not None for signal in one.signals]
         signals += [] if self.power is None else [*self.power.currents, *self.power.voltages]
         named = [one.topic for one in (self.pose, self.imu, self.interval) if one is not None]
-        velocity = [] if self.pose is None else [self.pose.velocity]
+        velocity = (
+            [] if self.pose is None else [self.pose.velocity, *(one.topic for one in self.pose.headings)]
+        )
         return {*(signal.topic for signal in signals), *named, *velocity} - {""}
 
     def rank_drives(self, role: Literal["command", "wheels"]) -> list[DriveSource]:
@@ -245,6 +249,8 @@ _UPSTREAM = re.compile(
 )
 _EXECUTED = re.compile(r"executed|cmd_vel_out|limited")
 _SATELLITES = re.compile(r"gps|gnss|navsat|nmea|rtk|ublox|septentrio|novatel|fix[_/]?vel")
+_HEADING = re.compile(r"heading|hdg|yaw|compass|azimuth|bearing")
+_NO_HEADING = re.compile(r"rate|err|vel|speed|offset|acc|cov|std|gyro|init")
 _LEFT = re.compile(r"left|(?<![a-z])(?:l|fl|rl|bl|ml|lf|lr|lb|lm)(?![a-z])|(?<![a-z])l(?=wheel|motor)")
 _FORMS = {"sides": DriveForm.SIDES, "body": DriveForm.BODY, "steering": DriveForm.STEERING}
 
@@ -270,6 +276,17 @@ class Topics:
         """Topics of one number."""
         kinds = {topic: find_type(kind).number for topic, kind in self.types.items()}
         return {topic: number for topic, number in kinds.items() if number is not None}
+
+    def headings(self) -> tuple[Signal, ...]:
+        """Numbers that are headings by their names, of a compass or of two antennas."""
+        return tuple(
+            _signal(topic, number)
+            for topic, number in self.numbers().items()
+            if not number.quantity
+            and _HEADING.search(topic.lower())
+            and not _NO_HEADING.search(topic.lower())
+            and not COMMANDED.search(topic.lower())
+        )
 
     def ground_velocities(self) -> list[str]:
         """Topics of velocities east and north, by type and name: of a receiver, or beside its fixes."""

@@ -138,6 +138,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         scale: factor on recorded speeds, where encoders count low or high.
         factors: the same of a side (``left``, ``right``) or of a joint, below zero where it counts backward.
         ignore: spans whose readings are none; empty: all are taken as recorded.
+        interpolate: whether commands that the recorder lost are taken to be between the ones around them.
         time: which of the message's times to use.
         late_s: how much later than its moment a message is stamped; below zero: earlier.
         hold_s: how long a command stays valid.
@@ -163,6 +164,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     scale: Positive | None = None
     factors: dict[str, float] | None = None
     ignore: list[OutageSection] | None = None
+    interpolate: bool = False
     time: Clock | None = None
     late_s: float | None = None
     hold_s: Positive | None = None

@@ -385,12 +385,13 @@ class _Chooser:
 
     def _by_satellites(self, topic: str, reason: str) -> PoseSource:
         """Fixes with the velocities published with them, or velocities alone."""
+        headings = self._own().headings()
         if find_type(self.types[topic]).fix is None:
-            return PoseSource(topic, reason, content=PoseContent.VELOCITY)
+            return PoseSource(topic, reason, content=PoseContent.VELOCITY, headings=headings)
         beside = self._own().ground_velocities()
         shared = [len(os.path.commonpath((topic, each))) for each in beside]
         nearest = beside[shared.index(max(shared))] if beside else ""
-        return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest)
+        return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest, headings=headings)
 
     def _dynamic_transforms(self, *, is_configured: bool) -> str:
         topics = [one.topic for one in wanted_transforms(self.types) if not one.topic.endswith("static")]
@@ -405,7 +406,8 @@ class _Chooser:
         pose = find_type(self.types[topic]).pose
         if pose is not None and not (pose.orientation or pose.angle):
             is_position = is_localization(name) or _PLACE.search(name)
-            return (1.0, PoseSource(topic, "positions by its type and name")) if is_position else None
+            made = PoseSource(topic, "positions by its type and name", headings=self._own().headings())
+            return (1.0, made) if is_position else None
         if is_localization(name):
             return 3.0, PoseSource(topic, "a localization by its name")
         if DEAD_RECKONED.search(name):

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -43,10 +44,14 @@ from pipeline.stages.drive import (
 )
 from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.findings import Finding, StageError, blame_damage
+from pipeline.stages.lost_messages import fill_gaps
 from pipeline.stages.pose_topics import Cut, read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.tilt import lean
 from pipeline.stages.trust import check_echo
+
+if TYPE_CHECKING:
+    from pipeline.stages.satellite import Turning
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
@@ -513,8 +518,7 @@ class Extraction:
             return None
         from pipeline.stages.satellite import head_positions  # noqa: PLC0415 - few logs need it
 
-        imu = self._timed(self.sources.imu.topic) if self.sources.imu else None
-        located = head_positions(arrays, receiver, imu, self._read_ahead())
+        located = head_positions(arrays, receiver, self._list_turnings(source), self._read_ahead())
         self.findings += () if located is None else located.findings
         return located
 
@@ -527,16 +531,13 @@ class Extraction:
         """Messages of a satellite receiver that give a pose, in time order, and these poses."""
         from pipeline.stages.satellite import locate_vehicle  # noqa: PLC0415 - few logs need it
 
-        receiver, beside, imu = (
-            self._timed(topic)
-            for topic in (source.topic, source.velocity, self.sources.imu.topic if self.sources.imu else "")
-        )
+        receiver, beside = self._timed(source.topic), self._timed(source.velocity)
         if receiver is None:
             raise self._nothing("pose", source.topic)
         lever, findings = pose_topics.find_antenna(
             self.data.topics, reading.frame_of(receiver.columns), source.topic
         )
-        made = locate_vehicle(receiver, beside, imu, self._read_ahead(), lever)
+        made = locate_vehicle(receiver, beside, self._list_turnings(source), self._read_ahead(), lever)
         self.findings += [*findings, *made.findings]
         if not made.rows.size:
             times = receiver.times[receiver.order]
@@ -551,6 +552,17 @@ class Extraction:
             hint = "Record an IMU beside them, a faster receiver, or a localization with a heading."
             raise StageError("no_pose", what, where=self.where, hint=hint)
         return made.rows, made.arrays
+
+    def _list_turnings(self, source: PoseSource) -> list["Turning"]:
+        """Sensors that turn with a vehicle of which positions alone are recorded."""
+        from pipeline.stages.satellite import list_turnings, read_headings  # noqa: PLC0415 - few logs need it
+
+        imu = self._timed(self.sources.imu.topic) if self.sources.imu else None
+        turnings = [] if imu is None else list_turnings(imu)
+        for signal in source.headings:
+            number = self._timed(signal.topic)
+            turnings += [] if number is None else read_headings(number, signal.field)
+        return turnings
 
     def _timed(self, topic: str) -> reading.Receiver | None:
         ordered = self._ordered(topic)
@@ -636,6 +648,8 @@ class Extraction:
         frame = pl.DataFrame(
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
+        if section.interpolate:
+            frame = fill_gaps(frame)
         if section.ignore:
             frame = self._leave_out(frame, section.ignore, held=held)
         return frame.with_columns(

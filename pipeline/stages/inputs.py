@@ -183,8 +183,14 @@ def cut_steps(
     )
 
 
+_JITTER = 1.5
+"""Longest gap between commands that are sent steadily [usual periods]: a longer one lacks a command."""
+
+
 def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float) -> Ideal:
     """Ideal velocities of the last command at each time, while it is valid.
+
+    A controller that holds its command for less than the usual period stops in between, which is no silence.
 
     Args:
         times: grid [s].
@@ -196,8 +202,11 @@ def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold:
     index = arrays.hold_indices(times, stamps)
     known = index >= 0
     last = np.maximum(index, 0)
-    stale = known & (times - stamps[last] > hold)
+    age = times - stamps[last]
+    period = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+    stale = known & (age > max(hold, _JITTER * period))
     velocity = _predict(commands, vehicle)[last]
+    velocity[age > hold] = 0.0
     velocity[~known | stale] = np.nan
     active = commands["active"].to_numpy()[last] & known
     return Ideal(velocity, stale & active, active)

@@ -211,8 +211,8 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     if source.content is PoseContent.POSE and pose is not None:
         axes = (*axis_fields(pose.position, "xyz"), *_turn_fields(pose))
         named = (*axes, pose.parent, pose.child, pose.names)
-        return [Signal(source.topic, name) for name in named if name]
-    fields = [Signal(source.topic, _FRAME)]
+        return [*(Signal(source.topic, name) for name in named if name), *source.headings]
+    fields = [Signal(source.topic, _FRAME), *source.headings]
     if kind.fix is not None:
         names = (kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status)
         fields += [Signal(source.topic, name) for name in names]

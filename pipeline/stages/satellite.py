@@ -30,6 +30,7 @@ _WINDOW_S: Final = 1.0
 """Span [s] over which velocities are derived from positions, and turning is compared."""
 _NOISES: Final = 5.0
 """Least speed of a valid course [its standard deviations]: the course is then accurate to 0.2 rad."""
+_FEWEST_STEPS: Final = 3  # of a course: one of two points is noise, and three leave no residual
 _AROUND_S: Final = (-1.0, -0.5, 0.0, 0.5)
 """Times [s] about a course at which the drive's direction must be equal: a drive lags behind its command."""
 _ALIGN_S: Final = 30.0
@@ -70,12 +71,14 @@ class Course:
         velocity: east and north [m/s], shape (n, 2).
         direction: 1 where the vehicle drives ahead, -1 backwards, 0 where unknown, shape (n,).
         slowest: speed below which the direction of motion is noise [m/s].
+        window_s: span over which it is smoothed [s]; zero of velocities that a receiver gives.
     """
 
     times: Floats
     velocity: Floats
     direction: Floats
     slowest: float
+    window_s: float = 0.0
 
     def angles(self) -> tuple[Floats, Flags]:
         """Heading of a vehicle without sideways slip [rad], and where it is known."""
@@ -92,18 +95,38 @@ class Heading:
     finding: Finding
 
 
-def follow_track(times: Floats, position: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
+def follow_track(
+    times: Floats, position: Floats, ahead: tuple[Floats, Floats] | None, window_s: float = _WINDOW_S
+) -> Course:
     """The course from positions.
 
     Args:
         times: [s], strictly increasing, shape (n,), n >= 2.
         position: [m], shape (n, 3).
         ahead: times [s] and forward speed [m/s] of the wheels or the command.
+        window_s: span over which it is derived [s].
     """
-    velocity = arrays.differentiate_locally(times, times, position[:, :2], _WINDOW_S)
-    count = max(arrays.count_steps(times, _WINDOW_S), 4)
-    noise = estimate_noise(position[:, :2]) * np.sqrt(12.0 / count) / _WINDOW_S
-    return Course(times, velocity, _find_direction(times, ahead), max(MOVING_MPS, _NOISES * noise))
+    velocity = arrays.differentiate_locally(times, times, position[:, :2], window_s)
+    count = max(arrays.count_steps(times, window_s), 4)
+    noise = estimate_noise(position[:, :2]) * np.sqrt(12.0 / count) / window_s
+    slowest = max(MOVING_MPS, _NOISES * noise)
+    return Course(times, velocity, _find_direction(times, ahead), slowest, window_s)
+
+
+def follow_closely(times: Floats, position: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
+    """The course over the shortest span that leaves it known in most of the driving; see `follow_track`.
+
+    Where the course is the heading itself, a span smooths turns, and a lesser turn is an effect.
+    """
+    whole = follow_track(times, position, ahead)
+    speed = np.linalg.norm(whole.velocity, axis=1)
+    usual = float(np.median(speed[speed > whole.slowest])) if (speed > whole.slowest).any() else 0.0
+    period = float(np.median(np.diff(times)))
+    for steps in range(_FEWEST_STEPS, int(_WINDOW_S / period)):
+        course = follow_track(times, position, ahead, steps * period)
+        if course.slowest < 0.5 * usual:
+            return course
+    return whole
 
 
 def follow_velocity(times: Floats, velocity: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
@@ -156,7 +179,12 @@ def read_over_ground(times: Floats, position: Floats, clock: Floats, velocity: F
 
 
 def find_heading(
-    times: Floats, course: Course, turnings: Sequence[Turning], lever: Floats, topic: str
+    times: Floats,
+    course: Course,
+    turnings: Sequence[Turning],
+    lever: Floats,
+    topic: str,
+    alone: Course | None = None,
 ) -> Heading:
     """The heading at some times.
 
@@ -166,10 +194,11 @@ def find_heading(
         turnings: sensors, the best first.
         lever: position of the antenna on the vehicle, ahead and left [m], shape (2,).
         topic: for the finding.
+        alone: the course to take where no sensor turns with the vehicle, if it is another.
     """
     fits = [(turning, fit) for turning in turnings if (fit := _fit_sensor(turning, course)) is not None]
     if not fits:
-        return _take_course(times, course, topic)
+        return _take_course(times, alone or course, topic)
     turning, (scale, bias, _) = min(fits, key=lambda one: one[1][2])
 
     def turned(at: Floats) -> Floats:
@@ -271,10 +300,14 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
         )
     share = float(np.mean(~np.isfinite(yaw)))
     text = (
-        f"the heading of {topic} is its course over ground, since no IMU that turns with it was "
-        f"recorded or agrees: lateral slip is not observable and reads zero, and turns are smoothed over "
-        f"{_WINDOW_S:g} s, which makes those that change faster look smaller"
+        f"the heading of {topic} is its course over ground, since no sensor that turns with it was recorded "
+        "or agrees: lateral slip is not observable and reads zero"
     )
+    if course.window_s:
+        text += (
+            f", and turns are smoothed over {course.window_s:.2g} s, which makes those that change faster "
+            "look smaller"
+        )
     if share:
         text += (
             f"; {format_share(share)} of the positions are left out, where the vehicle stands or turns about"
@@ -341,7 +374,7 @@ def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Flo
 def locate_vehicle(
     receiver: Receiver,
     beside: Receiver | None,
-    imu: Receiver | None,
+    turnings: Sequence[Turning],
     ahead: tuple[Floats, Floats] | None,
     lever: Floats,
 ) -> Located:
@@ -350,7 +383,7 @@ def locate_vehicle(
     Args:
         receiver: fixes, or velocities over ground if there are none.
         beside: velocities that belong to the fixes.
-        imu: gyro, and attitude if available.
+        turnings: sensors that turn with the vehicle.
         ahead: times [s] and forward speed [m/s] of the wheels or the command.
         lever: position of the antenna in base_link [m], shape (3,).
     """
@@ -360,7 +393,7 @@ def locate_vehicle(
     if track.rows.size < reading.FEWEST_MESSAGES:
         nothing = PoseArrays(np.zeros((0, 3)), np.zeros((0, 4)), _PARENT, _CHILD)
         return Located(track.rows[:0], nothing, track.findings)
-    times = receiver.times[track.rows]
+    times, alone = receiver.times[track.rows], None
     if track.velocity is not None:
         course = follow_velocity(times, track.velocity, ahead)
     else:
@@ -370,13 +403,14 @@ def locate_vehicle(
             course = follow_velocity(clock, over_ground, ahead)
         else:
             course = follow_track(times, track.position, ahead)
+            alone = follow_closely(times, track.position, ahead)
         if beside is not None and over_ground is None:
             text = f"{beside.columns.topic} does not say how {topic} moves over ground: it was not used"
             findings.append(Finding("velocity_disagrees", "warning", text, where=beside.columns.topic))
     if ahead is None:
         text = f"neither wheels nor commands show when the vehicle of {topic} reversed: forward is assumed"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
-    heading = find_heading(times, course, [] if imu is None else list_turnings(imu), lever[:2], topic)
+    heading = find_heading(times, course, turnings, lever[:2], topic, alone)
     headed = np.isfinite(heading.yaw)
     quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
     arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
@@ -446,6 +480,16 @@ def list_turnings(imu: Receiver) -> list[Turning]:
     return turnings
 
 
+def read_headings(number: Receiver, field: str) -> list[Turning]:
+    """A number that may be a heading, in radians and in degrees: the course tells which, and its sense."""
+    values, times = reading.numbers(number.columns, field)[number.order], number.times[number.order]
+    known = np.isfinite(values)
+    if known.sum() < reading.FEWEST_MESSAGES:
+        return []
+    name, angles = number.columns.topic, (values[known], np.radians(values[known]))
+    return [Turning(name, times[known], np.unwrap(angle)) for angle in angles]
+
+
 def is_new(times: Floats, position: Floats) -> Flags:
     """Whether a position is new: one repeated while the antenna moves comes from a slow receiver."""
     if times.size < 2:  # noqa: PLR2004 - one position is new
@@ -461,14 +505,14 @@ def is_new(times: Floats, position: Floats) -> Flags:
 
 
 def head_positions(
-    arrays: PoseArrays, receiver: Receiver, imu: Receiver | None, ahead: tuple[Floats, Floats] | None
+    arrays: PoseArrays, receiver: Receiver, turnings: Sequence[Turning], ahead: tuple[Floats, Floats] | None
 ) -> Located | None:
     """Poses of a position-only topic, with the course as heading, or a gyro aligned with the course.
 
     Args:
         arrays: poses of all messages.
         receiver: the topic with its clock.
-        imu: gyro, and attitude if available.
+        turnings: sensors that turn with the vehicle.
         ahead: times [s] and forward speed [m/s] of the wheels or the command.
 
     Returns:
@@ -480,8 +524,8 @@ def head_positions(
     )
     rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
     times, position = receiver.times[rows], arrays.position[rows]
-    turnings = [] if imu is None else list_turnings(imu)
-    heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
+    course, closely = (follow(times, position, ahead) for follow in (follow_track, follow_closely))
+    heading = find_heading(times, course, turnings, np.zeros(2), topic, closely)
     headed = np.isfinite(heading.yaw)
     if headed.sum() < FEWEST_MESSAGES:
         return None

@@ -58,6 +58,11 @@ _SAME = 0.03
 """Fraction of the usual largest speed below which a difference is no contradiction."""
 _LASTS_NATS = 0.1
 """Price of every block of a span [nats], so that it ends with the last block that shows it."""
+_ENDS_NATS = -math.log(1.0 - math.exp(-_LASTS_NATS))
+"""Price of the end of a span [nats], with which its length has the probability that `_LASTS_NATS` means.
+
+While the source drives, what a fit does not know lasts, too: there the end costs as much as the start.
+"""
 _FEWEST_BLOCKS = 40
 """Least number of blocks for a fit of eighteen coefficients."""
 _ROUNDS = 8
@@ -230,15 +235,17 @@ def price_change(count: int) -> float:
     return float(np.log(count / LEVEL))
 
 
-def follow_likeliest(gains: Floats, price: float) -> list[tuple[int, slice]]:
+def follow_likeliest(gains: Floats, price: float, ends: float | None = None) -> list[tuple[int, slice]]:
     """Likeliest spans of other hypotheses, with their numbers (Viterbi).
 
     Args:
         gains: log-likelihood of other hypotheses less that of the usual one, shape (m, k).
         price: of a change [nats]; see `price_change`.
+        ends: price of the change back to the usual one, if it is another.
     """
     gains = np.column_stack((np.zeros(len(gains)), gains - _LASTS_NATS))
     change = price * (1.0 - np.eye(gains.shape[1]))
+    change[1:, 0] = price if ends is None else ends
     # A recording may begin and end at any time.
     score, origin = np.zeros(gains.shape[1]), np.zeros(gains.shape, dtype=np.int64)
     for k, gain in enumerate(gains):
@@ -552,7 +559,11 @@ def _list_contradictions(
     gains, made = fit.compare(), []
     halves = fit.compare_sides() if has_sides else gains[:, :0]
     size = np.abs(source).sum(axis=1)
-    for _, part in follow_likeliest(gains[:, 2:], blocks.price):
+    parts = [part for _, part in follow_likeliest(gains[:, 2:], blocks.price)]
+    at_rest = np.where(size[:, None] > LIVE_SHARE * fit.top, -blocks.price, gains[:, 2:])
+    short = [part for _, part in follow_likeliest(at_rest, blocks.price, _ENDS_NATS)]
+    parts += [one for one in short if not any(one.start < at.stop and at.start < one.stop for at in parts)]
+    for part in parts:
         first, last = part.start, part.stop - 1
         stands, free, mixed, turned = gains[part].T
         # Where it shows, not where both stand.

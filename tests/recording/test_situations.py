@@ -181,6 +181,15 @@ def test_of_commands_in_percent_no_unit_is_sure(tmp_path: Path) -> None:
     np.testing.assert_allclose(scales * by_unit, [1.0 / 125.0, GAIN / 140.0], rtol=0.03)
 
 
+def test_of_commands_from_minus_one_to_one_no_gain_is_told(tmp_path: Path) -> None:
+    drive = draw(54)
+    log = write_log(tmp_path / "log.mcap", drive, asked=drive.asked / [1.6, 2.0], is_measured=False)
+    setup = set_up_log(log, Options(out=tmp_path))
+    assert any("have no sure unit" in one.text for one in setup.choice.findings)
+    scales = [setup.alignment.command_scale, setup.alignment.command_turn_scale]
+    np.testing.assert_allclose(scales, [1.6, 2.0 * GAIN], rtol=0.03)
+
+
 def test_a_car_that_takes_a_twist_for_a_steering_angle_is_read_so(tmp_path: Path) -> None:
     drive, wheelbase = draw(55), 1.2
     asked = drive.asked * [1.0, 0.4]

@@ -62,15 +62,15 @@ def push(start: float, seconds: float, metres: float) -> Floats:
     ("rolls", "counted", "kind"),
     [(False, True, "pushed"), (True, True, "manual_driving"), (False, False, "manual_driving")],
 )
-@pytest.mark.parametrize("metres", [0.11, -0.3])
+@pytest.mark.parametrize(("metres", "seconds"), [(0.11, 2.0), (-0.3, 2.0), (0.2, 1.5), (0.2, 1.0)])
 def test_who_pushes_a_robot_is_found_with_its_times(
-    metres: float, kind: str, *, rolls: bool, counted: bool
+    metres: float, seconds: float, kind: str, *, rolls: bool, counted: bool
 ) -> None:
-    moved = push(74.0, 2.0, metres)
+    moved = push(74.0, seconds, metres)
     (found,) = find_incidents(moved, 0.0 * moved, rolls=rolls, counted=counted)
     assert found.kind == kind
     assert found.start == pytest.approx(74.0, abs=1.0)
-    assert found.end == pytest.approx(76.0, abs=1.0)
+    assert found.end == pytest.approx(74.0 + seconds, abs=1.0)
 
 
 def test_poses_that_jitter_at_rest_are_no_push() -> None:

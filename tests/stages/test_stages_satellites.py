@@ -15,7 +15,15 @@ from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
 from pipeline.simulate.sensors import to_earth
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver
-from pipeline.stages.satellite import locate_vehicle, read_over_ground, to_local_plane
+from pipeline.stages.satellite import (
+    Turning,
+    follow_closely,
+    list_turnings,
+    locate_vehicle,
+    read_headings,
+    read_over_ground,
+    to_local_plane,
+)
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 SKIDDING = replace(
@@ -127,7 +135,7 @@ def receive(change: Callable[[dict[str, np.ndarray]], object]) -> Receiver:
     ids=["a status below zero", "zero and zero", "no number", "beyond the pole"],
 )
 def test_what_is_no_fix_is_left_out_and_counted(change: Callable[..., object], lost: int) -> None:
-    made = locate_vehicle(receive(change), None, None, None, np.zeros(3))
+    made = locate_vehicle(receive(change), None, [], None, np.zeros(3))
     (said,) = [finding for finding in made.findings if finding.id == "no_fix"]
     assert said.count == lost
     assert made.rows.size == 300 - lost
@@ -136,7 +144,7 @@ def test_what_is_no_fix_is_left_out_and_counted(change: Callable[..., object], l
 
 def test_an_altitude_that_is_not_known_moves_nothing_sideways() -> None:
     made = locate_vehicle(
-        receive(lambda fields: fields["altitude"].fill(np.nan)), None, None, None, np.zeros(3)
+        receive(lambda fields: fields["altitude"].fill(np.nan)), None, [], None, np.zeros(3)
     )
     moved = np.diff(made.arrays.position[:, :2], axis=0)
     np.testing.assert_allclose(moved, 0.2, rtol=1e-3)
@@ -151,7 +159,9 @@ def test_a_log_with_hardly_a_fix_has_no_pose_and_no_crash(count: int) -> None:
     few = replace(whole, order=whole.order[:count])
     stamps = whole.columns.log_time[:0]
     silent = TopicColumns("/imu", 2, "sensor_msgs/msg/Imu", stamps, stamps, stamps, {}, ())
-    made = locate_vehicle(few, None, Receiver(silent, np.zeros(0), whole.order[:0]), None, np.zeros(3))
+    made = locate_vehicle(
+        few, None, list_turnings(Receiver(silent, np.zeros(0), whole.order[:0])), None, np.zeros(3)
+    )
     assert made.rows.size == (count if count == 30 else 0)
     assert made.arrays.position.shape == (made.rows.size, 3)
 
@@ -205,3 +215,61 @@ def test_poses_that_look_one_way_all_the_time_are_positions_alone(
     assert moving.height > 300
     assert rms(moving["g_x"]) < 0.05
     assert lateral_skid(taken) == pytest.approx(0.08 if turns else 0.0, abs=0.02)
+
+
+def wind(noise_m: float = 0.005) -> tuple[Receiver, np.ndarray]:
+    """Two minutes of fixes at 5 Hz of a vehicle that turns both ways at 1 m/s, and its heading [rad]."""
+    times = np.arange(0.0, 120.0, 0.2)
+    yaw = 0.5 + 2.0 * np.sin(0.5 * times) + 0.02 * times
+    way = np.cumsum(np.stack((np.cos(yaw), np.sin(yaw), 0.0 * yaw), axis=-1), axis=0) * 0.2
+    way += np.random.default_rng(1).normal(0.0, noise_m, way.shape)
+    latitude, longitude, altitude = to_earth(way)
+    fields = {"latitude": latitude, "longitude": longitude, "altitude": altitude, "status.status": 0.0 * yaw}
+    stamps = (times * 1e9).astype(np.int64)
+    columns = TopicColumns("/fix", 1, "sensor_msgs/msg/NavSatFix", stamps, stamps, stamps, fields, ())
+    return Receiver(columns, times, np.arange(times.size)), yaw
+
+
+def read_number(values: np.ndarray, like: Receiver) -> list[Turning]:
+    columns = replace(
+        like.columns, topic="/compass", type_name="std_msgs/msg/Float64", fields={"data": values}
+    )
+    return read_headings(replace(like, columns=columns), "data")
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+@pytest.mark.parametrize("sense", ["compass", "counterclockwise"])
+def test_a_number_is_the_heading_in_any_unit_and_sense(unit: str, sense: str) -> None:
+    receiver, yaw = wind()
+    values = (np.pi / 2.0 - yaw if sense == "compass" else yaw) % (2.0 * np.pi)
+    values = np.degrees(values) if unit == "deg" else values
+    made = locate_vehicle(receiver, None, read_number(values, receiver), None, np.zeros(3))
+    (said,) = [one for one in made.findings if one.id == "heading_from_imu"]
+    assert "that of /compass" in said.text
+    found = 2.0 * np.arctan2(made.arrays.quaternion[:, 2], made.arrays.quaternion[:, 3])
+    off = np.angle(np.exp(1j * (found - yaw[made.rows])))
+    # The course of a step is that in its middle.
+    assert np.abs(off - np.median(off)).max() < 0.05
+    assert abs(np.median(off)) < 0.15
+
+
+def test_a_number_that_does_not_turn_with_the_vehicle_is_no_heading() -> None:
+    receiver, yaw = wind()
+    other = np.cumsum(np.random.default_rng(2).normal(0.0, 0.3, yaw.size))
+    made = locate_vehicle(receiver, None, read_number(other, receiver), None, np.zeros(3))
+    assert "heading_from_course" in {one.id for one in made.findings}
+
+
+@pytest.mark.parametrize(("noise_m", "longest_s"), [(0.01, 0.61), (0.3, 1.01)], ids=["fine", "coarse"])
+def test_a_course_is_derived_over_no_longer_than_its_noise_asks_for(noise_m: float, longest_s: float) -> None:
+    receiver, yaw = wind()
+    way = np.cumsum(np.stack((np.cos(yaw), np.sin(yaw), 0.0 * yaw), axis=-1), axis=0) * 0.2
+    way += np.random.default_rng(1).normal(0.0, noise_m, way.shape)
+    course = follow_closely(receiver.times, way, None)
+    assert course.window_s == pytest.approx(longest_s, abs=0.02)
+
+
+def test_numbers_are_headings_by_their_names() -> None:
+    names = ("/compass_hdg", "/gps/heading_deg", "/yaw_rate", "/heading_error", "/cmd/heading", "/speed")
+    topics = Topics(dict.fromkeys(names, "std_msgs/Float64"))
+    assert [one.topic for one in topics.headings()] == ["/compass_hdg", "/gps/heading_deg"]
