@@ -107,7 +107,7 @@ STAGE = "diagnosis"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
-VERSION = 56
+VERSION = 55
 
 
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
