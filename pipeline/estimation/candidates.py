@@ -239,11 +239,11 @@ class Screen:
         """
         fit = self.saturated
         normal, pull, alone = _project(fit, self._columns, self._own)
-        left = np.diag(normal)
-        size = np.sqrt(np.maximum(left, 1e-24))
+        remaining = np.diag(normal)
+        size = np.sqrt(np.maximum(remaining, 1e-24))
         deviation = math.sqrt(max(float(np.mean(fit.white.residual**2)), 1e-6))
         scaled = normal / np.outer(size, size) + RIDGE * np.eye(size.size)
-        return scaled, pull / (size * deviation), size / deviation, left >= _INDEPENDENT * alone
+        return scaled, pull / (size * deviation), size / deviation, remaining >= _INDEPENDENT * alone
 
     @cached_property
     def _alone(self) -> list[Extension | None]:

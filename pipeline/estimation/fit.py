@@ -281,9 +281,9 @@ def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
 
 def approach_each(base: PathFit, starts: Sequence[ModelState], noise: Noise) -> list[PathFit]:
     """`approach` from the better half of some starts: those whose first step promises least cost."""
-    begun = [_begin_extension(base, start) for start in starts]
-    begun.sort(key=lambda fit: fit.score - fit.expected_fall)
-    return [_go_on(fit, base, noise) for fit in begun[: (len(begun) + 1) // 2]]
+    extended = [_begin_extension(base, start) for start in starts]
+    extended.sort(key=lambda fit: fit.score - fit.expected_fall)
+    return [_go_on(fit, base, noise) for fit in extended[: (len(extended) + 1) // 2]]
 
 
 def _begin_extension(base: PathFit, start: ModelState) -> PathFit:

@@ -244,16 +244,16 @@ def _maximize(
     if known is not None and not exact:
         phi, part = (math.asin(math.sqrt(min(one, 1.0))) for one in (known[0] / most, known[1]))
         starts, radius = [(phi, part)], 0.06
-    places = []
+    ends = []
     for start in starts:
-        places.append(np.array([*start, math.inf]))
+        ends.append(np.array([*start, math.inf]))
         _descend(
             np.ascontiguousarray(values[:, 0]), steps.fresh, steps.kind, steps.lengths / step_s, most, radius,
-            _SAME_EXACT if exact else _SAME, _SAME_SCALE if exact else _NEAR_SCALE, places[-1],
+            _SAME_EXACT if exact else _SAME, _SAME_SCALE if exact else _NEAR_SCALE, ends[-1],
             np.empty((steps.lengths.size, _LANES)), np.empty(_LANES), np.empty(_ROWS * _LANES),
             np.empty((count, _LANES)), np.empty(_LANES), np.empty(_TERMS),
         )  # fmt: skip
-    phi, part, _ = min(places, key=lambda place: float(place[2])).tolist()
+    phi, part, _ = min(ends, key=lambda at: float(at[2])).tolist()
     return _read(phi, most), math.sin(part) ** 2
 
 
@@ -287,7 +287,7 @@ def _value(terms: Floats, x: float, y: float) -> float:
 
 
 @compiled()
-def _find_way(slope: float, curvature: float) -> float:
+def _find_axis_step(slope: float, curvature: float) -> float:
     """Step along an axis of a quadratic, at most `_FAR`.
 
     Downhill where it is curved downwards, too: a bound is a top where it is not the best place.
@@ -302,13 +302,13 @@ def _find_step(terms: Floats) -> tuple[float, float]:
     mean, half = 0.5 * (terms[3] + terms[5]), 0.5 * (terms[3] - terms[5])
     apart, angle = math.hypot(half, terms[4]), 0.5 * math.atan2(terms[4], half)
     x, y = math.cos(angle), math.sin(angle)
-    one = _find_way(x * terms[1] + y * terms[2], mean + apart)
-    other = _find_way(x * terms[2] - y * terms[1], mean - apart)
+    one = _find_axis_step(x * terms[1] + y * terms[2], mean + apart)
+    other = _find_axis_step(x * terms[2] - y * terms[1], mean - apart)
     return x * one - y * other, y * one + x * other
 
 
 @compiled()
-def _look_around(
+def _list_lanes(
     x: float, y: float, radius: float, most: float, lengths: Floats, keeps: Floats, shares: Floats
 ) -> None:
     """What `_rate` needs of a place and of those around it."""
@@ -332,7 +332,7 @@ def _descend(
     radius: float,
     same: float,
     near: float,
-    place: Floats,
+    at: Floats,
     keeps: Floats,
     shares: Floats,
     rows: Floats,
@@ -351,7 +351,7 @@ def _descend(
         radius: of the points around.
         same: difference of costs at which it has converged.
         near: see `_find_scales`.
-        place: angles of correlation and share where it begins; where it ends, and the least cost, shape (3,).
+        at: angles of correlation and share where it begins; where it ends, and the least cost, shape (3,).
         keeps: room, shape (kinds, lanes), as are the following for `_rate`, and (6,) for the terms.
         shares: room.
         rows: room.
@@ -359,15 +359,15 @@ def _descend(
         costs: room.
         terms: room.
     """
-    x, y, least = place[0], place[1], math.inf
+    x, y, least = at[0], at[1], math.inf
     for _ in range(_MOST_ROUNDS):
-        _look_around(x, y, radius, most, lengths, keeps, shares)
+        _list_lanes(x, y, radius, most, lengths, keeps, shares)
         _rate(values, fresh, kind, keeps, shares, rows, size, costs, near)
         lowest = costs.argmin()
         is_lower = costs[lowest] < least
         if is_lower:
             least = costs[lowest]
-            place[0], place[1] = x + radius * _AROUND[lowest, 0], y + radius * _AROUND[lowest, 1]
+            at[0], at[1] = x + radius * _AROUND[lowest, 0], y + radius * _AROUND[lowest, 1]
         for term in range(_TERMS):
             terms[term] = 0.0
             for k in range(_LANES):
@@ -379,11 +379,11 @@ def _descend(
         step_x, step_y = radius * step_x, radius * step_y
         if missed < same:
             # Not the best of eight points: which one that is depends on rounding.
-            place[0], place[1] = x + step_x, y + step_y
+            at[0], at[1] = x + step_x, y + step_y
             break
-        x, y = (x + step_x, y + step_y) if is_lower else (place[0], place[1])
+        x, y = (x + step_x, y + step_y) if is_lower else (at[0], at[1])
         radius *= 1.0 if is_lower and math.hypot(step_x, step_y) >= radius else _CLOSER
-    place[2] = least
+    at[2] = least
 
 
 def _filter(columns: Floats, steps: Steps, gains: Floats, weights: Floats) -> Floats:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import Flags, Floats, arrays
 from pipeline.run import STILL_MPS, read_wheel_times
 from pipeline.sources import Vehicle
+from pipeline.stages.lost_messages import number_gaps
 
 _SHARE_OF_RANGE = 0.02
 """Fraction of a command's range that counts as a change: joysticks and path followers vary by less."""
@@ -190,7 +191,8 @@ _JITTER = 1.5
 def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float) -> Ideal:
     """Ideal velocities of the last command at each time, while it is valid.
 
-    A controller that holds its command for less than the usual period stops in between, which is no silence.
+    A controller that holds its command for less than the period of a steady sender stops in between: that is
+    no silence.
 
     Args:
         times: grid [s].
@@ -203,7 +205,7 @@ def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold:
     known = index >= 0
     last = np.maximum(index, 0)
     age = times - stamps[last]
-    period = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+    _, period = number_gaps(stamps)
     stale = known & (age > max(hold, _JITTER * period))
     velocity = _predict(commands, vehicle)[last]
     velocity[age > hold] = 0.0
