@@ -27,6 +27,8 @@ def number_gaps(times: Floats) -> tuple[Ints, float]:
     if not gaps.size or (period := float(np.median(gaps))) <= 0.0:
         return number, 0.0
     usual = gaps[np.abs(gaps / period - 1.0) < _EVEN]
+    if not usual.size:
+        return number, 0.0
     period = float(usual.mean())
     counted = np.rint(gaps / period)
     is_short = counted <= PERIODS

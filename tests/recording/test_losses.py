@@ -118,6 +118,8 @@ def test_gaps_are_numbered_by_the_period() -> None:
     assert period == pytest.approx(0.05)
     assert np.bincount(number).tolist() == [1, 173, 1, 1]
     assert not number_gaps(np.cumsum(np.random.default_rng(1).uniform(0.02, 0.3, 200)))[0].any()
+    for few in ([], [0.0], [0.0, 0.1, 1.0]):
+        assert number_gaps(np.array(few))[1] == 0.0
 
 
 @pytest.mark.parametrize("hold_s", [0.25, 0.4], ids=str)
