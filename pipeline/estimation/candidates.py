@@ -222,7 +222,7 @@ class Screen:
         normal, pull, _ = _project(fit, self._columns, self._own)
         best: dict[str, tuple[float, Ints]] = {}
         for trial, places in zip(self.trials, self._places, strict=True):
-            at = np.array(places) - self._own
+            at = places - self._own
             step = invert(normal[np.ix_(at, at)]) @ pull[at]
             gain = float(step @ pull[at])
             if trial.effect.id not in best or gain > best[trial.effect.id][0]:

@@ -6,6 +6,7 @@ the course and from sensors that turn with the vehicle (see `Course`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -113,12 +114,17 @@ def follow_track(
     return Course(times, velocity, _find_direction(times, ahead), slowest, window_s)
 
 
-def follow_closely(times: Floats, position: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
+def follow_closely(whole: Course, position: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
     """The course over the shortest span that leaves it known in most of the driving; see `follow_track`.
 
     Where the course is the heading itself, a span smooths turns, and a lesser turn is an effect.
+
+    Args:
+        whole: the course over the usual span.
+        position: as of `follow_track`.
+        ahead: as of `follow_track`.
     """
-    whole = follow_track(times, position, ahead)
+    times = whole.times
     speed = np.linalg.norm(whole.velocity, axis=1)
     usual = float(np.median(speed[speed > whole.slowest])) if (speed > whole.slowest).any() else 0.0
     period = float(np.median(np.diff(times)))
@@ -184,7 +190,7 @@ def find_heading(
     turnings: Sequence[Turning],
     lever: Floats,
     topic: str,
-    alone: Course | None = None,
+    follow_alone: Callable[[], Course] | None = None,
 ) -> Heading:
     """The heading at some times.
 
@@ -194,11 +200,11 @@ def find_heading(
         turnings: sensors, the best first.
         lever: position of the antenna on the vehicle, ahead and left [m], shape (2,).
         topic: for the finding.
-        alone: the course to take where no sensor turns with the vehicle, if it is another.
+        follow_alone: finds the course to take where no sensor turns with the vehicle, if it is another.
     """
     fits = [(turning, fit) for turning in turnings if (fit := _fit_sensor(turning, course)) is not None]
     if not fits:
-        return _take_course(times, alone or course, topic)
+        return _take_course(times, course if follow_alone is None else follow_alone(), topic)
     turning, (scale, bias, _) = min(fits, key=lambda one: one[1][2])
 
     def turned(at: Floats) -> Floats:
@@ -393,7 +399,7 @@ def locate_vehicle(
     if track.rows.size < reading.FEWEST_MESSAGES:
         nothing = PoseArrays(np.zeros((0, 3)), np.zeros((0, 4)), _PARENT, _CHILD)
         return Located(track.rows[:0], nothing, track.findings)
-    times, alone = receiver.times[track.rows], None
+    times, follow_alone = receiver.times[track.rows], None
     if track.velocity is not None:
         course = follow_velocity(times, track.velocity, ahead)
     else:
@@ -403,14 +409,14 @@ def locate_vehicle(
             course = follow_velocity(clock, over_ground, ahead)
         else:
             course = follow_track(times, track.position, ahead)
-            alone = follow_closely(times, track.position, ahead)
+            follow_alone = partial(follow_closely, course, track.position, ahead)
         if beside is not None and over_ground is None:
             text = f"{beside.columns.topic} does not say how {topic} moves over ground: it was not used"
             findings.append(Finding("velocity_disagrees", "warning", text, where=beside.columns.topic))
     if ahead is None:
         text = f"neither wheels nor commands show when the vehicle of {topic} reversed: forward is assumed"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
-    heading = find_heading(times, course, turnings, lever[:2], topic, alone)
+    heading = find_heading(times, course, turnings, lever[:2], topic, follow_alone)
     headed = np.isfinite(heading.yaw)
     quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
     arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
@@ -524,8 +530,9 @@ def head_positions(
     )
     rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
     times, position = receiver.times[rows], arrays.position[rows]
-    course, closely = (follow(times, position, ahead) for follow in (follow_track, follow_closely))
-    heading = find_heading(times, course, turnings, np.zeros(2), topic, closely)
+    course = follow_track(times, position, ahead)
+    follow_alone = partial(follow_closely, course, position, ahead)
+    heading = find_heading(times, course, turnings, np.zeros(2), topic, follow_alone)
     headed = np.isfinite(heading.yaw)
     if headed.sum() < FEWEST_MESSAGES:
         return None

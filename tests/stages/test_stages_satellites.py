@@ -18,6 +18,7 @@ from pipeline.stages.reading import Receiver
 from pipeline.stages.satellite import (
     Turning,
     follow_closely,
+    follow_track,
     list_turnings,
     locate_vehicle,
     read_headings,
@@ -265,7 +266,7 @@ def test_a_course_is_derived_over_no_longer_than_its_noise_asks_for(noise_m: flo
     receiver, yaw = wind()
     way = np.cumsum(np.stack((np.cos(yaw), np.sin(yaw), 0.0 * yaw), axis=-1), axis=0) * 0.2
     way += np.random.default_rng(1).normal(0.0, noise_m, way.shape)
-    course = follow_closely(receiver.times, way, None)
+    course = follow_closely(follow_track(receiver.times, way, None), way, None)
     assert course.window_s == pytest.approx(longest_s, abs=0.02)
 
 
