@@ -98,7 +98,7 @@ def parse_size(text: str) -> int:
 
 
 def parse_memory_limit(text: str) -> int:
-    """The memory limit of a worker [bytes], at least what a worker needs before it reads anything.
+    """The memory limit of a process [bytes], at least what one needs before it reads anything.
 
     Raises:
         BatchError: ``bad_size``, ``memory_too_small``.
@@ -107,7 +107,7 @@ def parse_memory_limit(text: str) -> int:
     if size < _WORKER_BYTES:
         raise BatchError(
             "memory_too_small",
-            f"a worker does not start within a memory limit of {shorten(text)!r}",
+            f"slip does not start within a memory limit of {shorten(text)!r}",
             hint=f"Give at least {_WORKER_BYTES // 1_000_000}MB, or with large logs 2GB",
         )
     return size

@@ -6,14 +6,12 @@ the program, its verbs by task, and what errors become.
 
 import gc
 import importlib
-import itertools
-import json
 import os
 import re
 import sys
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal, get_args, get_origin
+from typing import Annotated, Literal, get_args, get_origin
 
 from cyclopts import (
     App,
@@ -29,10 +27,12 @@ from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     USAGE,
+    MemoryLimit,
+    limited_memory,
     print_error,
     print_lines,
     print_note,
-    summarize_error,
+    refuse_json,
 )
 from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
 
@@ -149,12 +149,26 @@ def _rename_out(words: Sequence[str]) -> list[str]:
     return [*renamed, *words[len(options) :]]
 
 
-def _refuse(words: Sequence[str], error: SlipError) -> None:
-    """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
-    if "--json" in itertools.takewhile(lambda word: word != "--", words):
-        content = {"runs": [], "errors": [summarize_error(error.where, error)]}
-        # One line: those who read `watch` read line by line.
-        sys.stdout.write(json.dumps(content) + "\n")
+def _build_launcher(app: App, words: Sequence[str]) -> App:
+    """The program as it is started: any verb within the memory limit that is an option of them all."""
+
+    @app.meta.default
+    def launch(
+        *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+        memory: Annotated[
+            str | None,
+            Parameter(
+                group=Group("Options", sort_key=len(_GROUPS)),
+                help="memory limit of a process, for example 2GB, also of a worker; the machine's by default",
+            ),
+        ] = None,
+    ) -> object:
+        limit = MemoryLimit(memory, conclude=partial(refuse_json, words))
+        command, bound, injected = app.parse_args(tokens, exit_on_error=False)
+        with limited_memory(limit):
+            return command(*bound.args, **bound.kwargs, **dict.fromkeys(injected, limit))
+
+    return app.meta
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -175,16 +189,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if verb in _MOVED:
             what = f"slip {verb} is now: slip {_MOVED[verb]} {verb}"
             print_note(f"slip: {what}")
-            _refuse(words, SlipError("usage", what, hint=f"See slip {_MOVED[verb]} --help"))
+            refuse_json(words, SlipError("usage", what, hint=f"See slip {_MOVED[verb]} --help"))
             sys.exit(USAGE)
-        code = build_app(verb)(words, exit_on_error=False)
+        code = _build_launcher(build_app(verb), words)(
+            words, exit_on_error=False, result_action="return_value"
+        )
     except CycloptsError as error:
         chain = " ".join(error.command_chain or ())
-        _refuse(words, SlipError("usage", str(error).rstrip("."), hint=f"See slip {chain} --help"))
+        refuse_json(words, SlipError("usage", str(error).rstrip("."), hint=f"See slip {chain} --help"))
         sys.exit(USAGE)
     except SlipError as error:
         print_error(error)
-        _refuse(words, error)
+        refuse_json(words, error)
         sys.exit(FAILED)
     except BrokenPipeError:
         # The reader of the pipe has exited (`slip ... | head`): no output is possible.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.analysis import STAGE_WORDS, Options
+from pipeline.batch import parse_memory_limit, parse_size
 from pipeline.core import INPUTS, SlipError, limit_memory, measure_memory
 
 if TYPE_CHECKING:
@@ -206,42 +208,63 @@ _SHARE = 0.8
 """Default memory limit as a fraction of the machine's memory; other processes need the rest."""
 
 
-@contextmanager
-def limited_memory(
-    size: str | None,
-    name_log: Callable[[], str],
-    conclude: Callable[[SlipError], None],
-) -> Iterator[None]:
-    """End the program with one line when it holds too much memory.
+@dataclass
+class MemoryLimit:
+    """The memory limit of a command, and what it says when it ends for it.
 
-    Args:
-        size: memory limit, for example ``2GB``; None for a share of the machine's.
-        name_log: which file is being worked on.
-        conclude: prints the results so far, where JSON was asked for.
-
-    Raises:
-        BatchError: ``bad_size``.
+    Attributes:
+        given: the limit as it was typed, for example 2GB; None for a share of the machine's memory.
+        at_work: which file is being worked on.
+        conclude: prints the error, and the results so far, as JSON, where that was asked for.
     """
-    limit = int(_SHARE * measure_memory()) if size is None else _parse_size(size)
 
-    def give_up(held: int) -> None:
-        what = f"it used {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
-        hint = "Give it more with --memory, or leave the log out"
-        error = SlipError("out_of_memory", what, where=name_log(), hint=hint)
+    given: str | None = None
+    at_work: str = ""
+    conclude: Callable[[SlipError], None] | None = None
+
+    @property
+    def limit_bytes(self) -> int:
+        """The limit of the process [bytes].
+
+        Raises:
+            BatchError: ``bad_size``, ``memory_too_small``.
+        """
+        return int(_SHARE * measure_memory()) if self.given is None else parse_memory_limit(self.given)
+
+    def end(self, held: int) -> None:
+        """End the process with one line; what it has written stays as it was, as after a kill."""
+        what = f"the command used {held / 1e9:.2g} GB of memory, more than {self.limit_bytes / 1e9:.2g} GB"
+        hint = "Give it more with --memory, or leave out what is that large"
+        error = SlipError("out_of_memory", what, where=self.at_work, hint=hint)
         print_error(error)
-        conclude(error)
+        if self.conclude is not None:
+            self.conclude(error)
         sys.stdout.flush()
-        # Only this ends a library's computation. As after a kill, the previous results are intact.
+        # Only this ends a library's computation.
         os._exit(FAILED)
 
-    with limit_memory(limit, give_up):
+
+Limit: TypeAlias = Annotated[MemoryLimit, Parameter(parse=False)]
+"""The memory limit of the command, given by `main` to the verbs that say more at their end."""
+
+
+@contextmanager
+def limited_memory(limit: MemoryLimit) -> Iterator[None]:
+    """Hold a command to its memory limit.
+
+    Raises:
+        BatchError: ``bad_size``, ``memory_too_small``.
+    """
+    with limit_memory(limit.limit_bytes, limit.end):
         yield
 
 
-def _parse_size(text: str) -> int:
-    from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
-
-    return parse_size(text)
+def refuse_json(words: Sequence[str], error: SlipError) -> None:
+    """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
+    if "--json" in itertools.takewhile(lambda word: word != "--", words):
+        content = {"runs": [], "errors": [summarize_error(error.where, error)]}
+        # One line: those who read `watch` read line by line.
+        sys.stdout.write(json.dumps(content) + "\n")
 
 
 Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]
@@ -294,7 +317,7 @@ def build_options(choices: Choices) -> Options:
         BatchError: ``bad_size``.
     """
     return Options(
-        max_inflated=None if choices.max_inflated is None else _parse_size(choices.max_inflated),
+        max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
         out=choices.results,
         config=choices.config,
         overrides=_list_overrides(choices),

@@ -17,7 +17,6 @@ from pipeline.batch import (
     Pruning,
     Request,
     count_cores,
-    parse_memory_limit,
     parse_shard,
     parse_size,
 )
@@ -29,6 +28,7 @@ from pipeline.cli.conventions import (
     FAILED,
     LOSSY,
     Choices,
+    Limit,
     build_options,
     explain_logs,
     format_counts,
@@ -114,7 +114,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     force: bool = False,
     retry_quarantined: bool = False,
     timeout: PositiveFloat = 3600.0,
-    memory: str | None = None,
+    limit: Limit,
     settle: NonNegativeFloat = 120.0,
     prune: bool = False,
     keep: NonNegativeInt = 1,
@@ -136,7 +136,6 @@ def run(  # noqa: D417 - the shared choices document themselves
         force: compute again what is already there.
         retry_quarantined: try logs again that killed their workers.
         timeout: longest time for one log [s].
-        memory: memory limit for one log, for example 2GB (default: a fair share of the machine's).
         settle: an unfinished log that changed within this time [s] counts as being written.
         prune: remove old generations afterwards; without logs, only that.
         keep: old generations to keep of each run.
@@ -165,8 +164,8 @@ def run(  # noqa: D417 - the shared choices document themselves
         shard=None if shard is None else parse_shard(shard),
         timeout_s=timeout,
         memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
-        if memory is None
-        else parse_memory_limit(memory),
+        if limit.given is None
+        else limit.limit_bytes,
         settle_s=settle,
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,

@@ -16,11 +16,12 @@ from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     All,
     Choices,
+    Limit,
+    MemoryLimit,
     Results,
     TrustCode,
     build_options,
     exit_code,
-    limited_memory,
     open_shown,
     print_error,
     print_json,
@@ -53,7 +54,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         Parameter(help="geometry to use where the run is of another vehicle than --model"),
     ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
-    memory: str | None = None,
+    limit: Limit,
     budget: str | None = None,
     everything: All = False,
     json: bool = False,
@@ -65,7 +66,6 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 
     Args:
         trust_code: trust the Python that the model file names, now and later.
-        memory: memory limit, for example 2GB (default: 80 % of the machine's).
         budget: CPU time that a search may take, for example 60s (default: 60s for up to 10 minutes of
             driving, more for longer runs); after it the best answer so far is given.
         everything: show all of the summary: where the error is, budget, limits, causes, ranges between runs.
@@ -76,24 +76,22 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         models.check_target(apply)
     known = _open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else estimation.parse_budget(budget)
-    diagnosed = Diagnosed()
+    diagnosed = Diagnosed(limit)
 
     def conclude(error: SlipError) -> None:
         if json:
-            row = summarize_error(diagnosed.at_work, error)
+            row = summarize_error(error.where, error)
             print_json({**diagnosed.to_json(), "errors": [row]})
 
-    with limited_memory(memory, lambda: diagnosed.at_work, conclude):
-        diagnose_logs(
-            diagnosed, logs, build_options(choices), known, vehicle_of, budget_s, quiet=quiet or json
-        )
+    limit.conclude = conclude
+    diagnose_logs(diagnosed, logs, build_options(choices), known, vehicle_of, budget_s, quiet=quiet or json)
     if apply is not None:
         diagnosed.errors += _apply(diagnosed.answers, apply, quiet=quiet or json)
     if json:
         omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
         print_json({**diagnosed.to_json(), **omitted})
     elif not quiet:
-        chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
+        chosen = {"model": model, "vehicle_of": vehicle_of, "memory": limit.given, "budget": budget}
         said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
         print_lines(diagnosed.list_lines(logs, said, apply, everything=everything))
     return diagnosed.end(quiet=quiet)
@@ -104,16 +102,16 @@ class Diagnosed:
     """Diagnoses of logs as they come.
 
     Attributes:
+        limit: the memory limit, which is told what is being worked on.
         answers: one for runs that were judged together.
         errors: errors as JSON objects; each affects only one log.
         lossy: logs with losses.
-        at_work: name of the current log.
     """
 
+    limit: MemoryLimit = field(default_factory=MemoryLimit)
     answers: list[_Answer] = field(default_factory=list)
     errors: list[dict[str, str]] = field(default_factory=list)
     lossy: list[str] = field(default_factory=list)
-    at_work: str = ""
 
     @property
     def runs(self) -> list[RunDiagnosis]:
@@ -172,7 +170,7 @@ def diagnose_logs(
         budget_s: CPU time of a search [s]; None for the usual one.
         quiet: print no progress.
     """
-    diagnosed.at_work = logs[0]
+    diagnosed.limit.at_work = logs[0]
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
 
     opened: dict[str, _Opened] = {}
@@ -180,7 +178,7 @@ def diagnose_logs(
     is_plain = known is None and budget_s is None and options.inputs == INPUTS
     named = [name for log in logs for name in list_named(log)]
     for vehicle, recordings in _gather(named, options, diagnosed, opened, quiet=quiet).values():
-        diagnosed.at_work = recordings[0].path
+        diagnosed.limit.at_work = recordings[0].path
         try:
             agreed = _agree(known, vehicle, recordings, owner)
             search = partial(_judge, recordings, agreed, options, known, budget_s, quiet=quiet)
@@ -220,7 +218,7 @@ def _gather(
 
     gathered: dict[str, tuple[sources.Vehicle, list[estimation.Recording]]] = {}
     for log in logs:
-        diagnosed.at_work = log
+        diagnosed.limit.at_work = log
         try:
             with open_shown(log, options, quiet=quiet) as run:
                 vehicle, recording = read_recording(run.manifest)

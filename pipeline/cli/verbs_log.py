@@ -22,11 +22,12 @@ from pipeline.cli.conventions import (
     LOSSY,
     All,
     Choices,
+    Limit,
+    MemoryLimit,
     TrustCode,
     build_options,
     exit_code,
     format_vehicle_source,
-    limited_memory,
     print_error,
     print_json,
     print_lines,
@@ -74,7 +75,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     model: Path | None = None,
     trust_code: TrustCode = False,
     force: bool = False,
-    memory: str | None = None,
+    limit: Limit,
     everything: All = False,
     json: bool = False,
     quiet: bool = False,
@@ -88,7 +89,6 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         trust_code: trust the Python that the model file names, now and later.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
-        memory: memory limit, for example 2GB (default: 80 % of the machine's).
         everything: show all of the summary: where the error is, budget, limits, topics.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
@@ -99,15 +99,12 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     outcomes: list[Outcome] = []
     errors: list[dict[str, str]] = []
 
-    def name_log() -> str:
-        return str(logs[min(len(outcomes) + len(errors), len(logs) - 1)])
-
     def conclude(error: SlipError) -> None:
         if json:
-            _print_json(outcomes, [*errors, summarize_error(name_log(), error)])
+            _print_json(outcomes, [*errors, summarize_error(error.where, error)])
 
-    with limited_memory(memory, name_log, conclude):
-        _analyze_all(logs, options, outcomes, errors, quiet=quiet or json)
+    limit.conclude = conclude
+    _analyze_all(logs, options, outcomes, errors, limit, quiet=quiet or json)
     if json:
         _print_json(outcomes, errors)
     elif not quiet:
@@ -129,6 +126,7 @@ def _analyze_all(
     options: Options,
     outcomes: list[Outcome],
     errors: list[dict[str, str]],
+    limit: MemoryLimit,
     *,
     quiet: bool,
 ) -> None:
@@ -139,6 +137,7 @@ def _analyze_all(
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     for log in logs:
+        limit.at_work = str(log)
         try:
             with show_progress(log.name, quiet=quiet) as progress:
                 outcomes.append(analyze_log(log, options, progress))
@@ -545,8 +544,7 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
 
     diagnosed, logs = Diagnosed(), [str(watched.path)]
-    with limited_memory(None, lambda: logs[0], lambda _: None):
-        diagnose_logs(diagnosed, logs, build_options(choices), quiet=json)
+    diagnose_logs(diagnosed, logs, build_options(choices), quiet=json)
     alarms = [alarm for run in diagnosed.runs for alarm in list_alarms(run.effects)]
     lines = diagnosed.list_lines(logs, spell_choices(choices))
     lines += [f"alarm     {alarm['text']}" for alarm in alarms]

@@ -19,10 +19,10 @@ from urllib.parse import urlencode
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.batch import parse_memory_limit
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
+    Limit,
     Results,
     print_json,
     print_note,
@@ -39,7 +39,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     host: str = "127.0.0.1",
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     timeout: PositiveFloat = 1800.0,
-    memory: str | None = None,
+    limit: Limit,
     open_browser: Annotated[bool, Parameter(name="--open")] = False,
     json: bool = False,
     quiet: bool = False,
@@ -56,7 +56,6 @@ def serve(  # noqa: D417 - the results folder documents itself
         host: address to listen on; anything but this machine's own opens it to the network.
         diagnosis: diagnose logs that are dropped on the page.
         timeout: longest time for an analysis or a diagnosis [s].
-        memory: memory limit for one, for example 2GB (default: half of the machine's).
         open_browser: open the page in the browser.
         json: print address and token as one JSON object.
         quiet: print nothing.
@@ -84,7 +83,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         )
     limits = Limits(
         timeout_s=timeout,
-        memory_bytes=measure_memory() // 2 if memory is None else parse_memory_limit(memory),
+        memory_bytes=measure_memory() // 2 if limit.given is None else limit.limit_bytes,
     )
     opened = ""
     # A folder that is not there yet is filled by dropped logs.

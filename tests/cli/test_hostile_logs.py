@@ -58,14 +58,25 @@ def test_a_log_with_checksums_is_not_called_unchecked(samples: Path) -> None:
     assert json.loads(seen.stdout)["unchecked"] is None
 
 
+def test_a_verb_that_only_reads_results_has_a_memory_limit(tmp_path: Path, samples: Path) -> None:
+    out = tmp_path / "out"
+    run_verb("analyze", samples / "husky_tile.mcap", "--results", out, "--no-diagnosis", "--no-report")
+    hungry = "SELECT a.t FROM slip a CROSS JOIN slip b CROSS JOIN slip c ORDER BY a.t"
+    done = run_program("results", "query", hungry, "--results", out, "--memory", "1GB", "--json")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("slip: the command used 1")
+    assert [error["code"] for error in json.loads(done.stdout)["errors"]] == ["out_of_memory"]
+
+
 @pytest.mark.parametrize("verb", ["analyze", "diagnose"])
 def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb: str) -> None:
     log = samples / "husky_tile.mcap"
-    done = run_program(verb, log, "--out", tmp_path / "out", "--memory", "60MB", "--json", "--quiet")
+    done = run_program(verb, log, "--out", tmp_path / "out", "--memory", "200MB", "--json", "--quiet")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"slip: {log}: it used 0.")
-    assert "more than 0.06 GB. Give it more with --memory" in line
+    assert line.startswith(f"slip: {log}: the command used 0.")
+    assert "more than 0.2 GB. Give it more with --memory" in line
     content = json.loads(done.stdout)
     assert content["runs"] == []
     assert [error["code"] for error in content["errors"]] == ["out_of_memory"]

@@ -150,7 +150,7 @@ WORDS: list[tuple[str, str]] = [
     ("batch schedule field --for cron", "what would be run every night: Unknown option: --for"),
     ("batch field --shard 0/4", "is not a shard"),
     ("batch field --memory lots", "is not a size"),
-    ("batch field --memory 1", "a worker does not start within a memory limit of '1'"),
+    ("batch field --memory 1", "slip does not start within a memory limit of '1'"),
     (f"batch field --max-inflated {'9' * 400}", "is not a size"),
     ("batch field --prune --quota much", "is not a size"),
     ("batch schedule field --at noon", "is not a time of day"),
