@@ -1,15 +1,21 @@
-"""Trees of message types: parsers of ROS 1, ROS 2 and IDL definitions, and the standard types."""
+"""Trees of message types, from definitions of ROS 1, ROS 2 and IDL, and the standard types.
+
+The rosbags library parses definitions. Here its fields become a tree of bounded size.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from typing import Final
 
 import numpy as np
+from rosbags.typesys.base import BaseType, Cardinality, Field, Message, TypesysError
+from rosbags.typesys.idl import IDLParser
+from rosbags.typesys.msg import MSGParser
 
 SEQUENCE: Final = -1
 """``Member.count`` of a sequence of variable length."""
@@ -36,15 +42,16 @@ MAX_DEPTH: Final = 64
 MAX_LEAVES: Final = 1 << 14
 """Maximum number of fields of a type with all nested types; those of a robot have hundreds."""
 
-_MAX_DIGITS: Final = 9
+_MAX_DEFINITION: Final = 1 << 18
+"""Maximum length of a definition with all nested types [characters]; those of a robot have thousands."""
+
+_MAX_NESTED: Final = 1 << 10
+"""Maximum number of opening brackets of an IDL definition: its parser calls itself for each."""
 
 _ALIASES: Final = {"byte": "uint8", "char": "uint8", "octet": "uint8", "boolean": "bool"}
 _ALIASES_ROS1: Final = {"byte": "int8", "char": "uint8"}
+_RULE: Final = f"\n{'=' * 80}\n"
 _SEPARATOR: Final = re.compile(r"^={3,}[ \t\r]*$", re.MULTILINE)
-_FIELD: Final = re.compile(
-    r"^(?P<type>[A-Za-z][\w/]*)(?P<text_bound><=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?"
-    r"\s+(?P<name>[A-Za-z]\w*)(?P<rest>.*)$"
-)
 
 
 class SchemaError(ValueError):
@@ -79,24 +86,13 @@ class Structure:
     members: tuple[Member, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class RawField:
-    """A field before its type is resolved: name, type as written, count as in ``Member``."""
-
-    name: str
-    type: str
-    count: int | None
-
-
-RawTypes = dict[str, list[RawField]]
-
-
 def short_name(name: str) -> str:
     """``package/Name`` of ``package/msg/Name`` or ``package::msg::Name``."""
     parts = [part for part in name.replace("::", "/").split("/") if part]
     return f"{parts[0]}/{parts[-1]}" if len(parts) > 1 else (parts[0] if parts else "")
 
 
+@lru_cache(256)
 def parse_msg(name: str, text: str, *, dialect: str = "ros2msg") -> Structure:
     """Parse a concatenated ``.msg`` definition.
 
@@ -106,68 +102,66 @@ def parse_msg(name: str, text: str, *, dialect: str = "ros2msg") -> Structure:
         dialect: ``ros2msg`` or ``ros1msg``.
 
     Raises:
-        SchemaError: a line or a type cannot be parsed.
+        SchemaError: the definition cannot be parsed, a type is not defined, contains itself, or exceeds
+            `MAX_FIXED` array elements or `MAX_LEAVES` fields.
     """
-    types: RawTypes = {}
-    for position, section in enumerate(_SEPARATOR.split(text)):
-        body = section.strip("\r\n ")
-        section_name = short_name(name)
-        if body.startswith("MSG:"):
-            head, _, body = body.partition("\n")
-            section_name = short_name(head[4:].strip())
-        elif position > 0:
-            continue
-        types.setdefault(section_name, list(_parse_fields(body, dialect)))
-    return resolve(short_name(name), types, dialect=dialect)
+    sections = [section.strip("\n ") for section in _SEPARATOR.split(text.replace("\r\n", "\n"))]
+    named = [body for body in sections[1:] if body.startswith("MSG:")]
+    first = sections[0] if sections[0].startswith("MSG:") else f"MSG: {name}\n{sections[0]}"
+    return _resolve(name, _parse(MSGParser, _RULE[1:].join(f"{body}\n" for body in [first, *named])), dialect)
 
 
-def _parse_fields(body: str, dialect: str) -> Iterator[RawField]:
-    for raw_line in body.splitlines():
-        line = raw_line.split("#", 1)[0].strip()
-        if not line:
-            continue
-        match = _FIELD.match(line)
-        if match is None:
-            raise SchemaError(f"a line of the definition is not a field: {line[:60]!r}")
-        if match["rest"].lstrip().startswith("="):
-            continue
-        count: int | None = None
-        if match["array"]:
-            fixed = bool(match["count"]) and not match["bound"]
-            count = parse_count(match["count"]) if fixed else SEQUENCE
-        yield RawField(match["name"], _rename(match["type"], dialect), count)
+_HIDDEN: Final = re.compile(
+    r'(?P<string>"(?:[^"\\]|\\.)*+(?:"|\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t\r]*#[^\n]*|^IDL:[^\n]*',
+    re.MULTILINE | re.DOTALL,
+)
+"""Strings and comments; an unclosed one extends to the end of the text, so that matching is linear."""
 
 
-def parse_count(digits: str) -> int:
-    """Parse the number of elements of an array.
+def parse_idl(name: str, text: str) -> Structure:
+    """Parse concatenated IDL definitions.
+
+    Args:
+        name: type of the message, ``package/msg/Name``.
+        text: ``module``, ``struct``, ``typedef`` and ``const`` declarations; ``===`` lines separate sections.
 
     Raises:
-        SchemaError: it has more than `_MAX_DIGITS` digits.
+        SchemaError: as `parse_msg`.
     """
-    if len(digits) > _MAX_DIGITS:
-        raise SchemaError(f"an array has a number of elements of {len(digits)} digits")
-    return int(digits)
+    plain = _HIDDEN.sub(lambda match: '""' if match["string"] else " ", text)
+    if sum(map(plain.count, "{([")) > _MAX_NESTED or "<<" in plain or "*" in plain:
+        raise SchemaError("it holds many brackets, or constants that must be computed")
+    parts = [part for part in _SEPARATOR.split(plain) if part.strip()]
+    parsed = [message for part in parts for message in _parse(IDLParser, part)]
+    return _resolve(name, parsed)
 
 
-def _rename(type_name: str, dialect: str) -> str:
-    aliases = _ALIASES_ROS1 if dialect == "ros1msg" else _ALIASES
-    return aliases.get(type_name, type_name)
+def _parse(parser: type[MSGParser | IDLParser], text: str) -> list[Message]:
+    if len(text) > _MAX_DEFINITION:
+        raise SchemaError(f"it has {len(text)} characters")
+    try:
+        return parser(text).specification()
+    # The library asserts what its grammar should exclude, and converts numbers of any length.
+    except (TypesysError, ValueError, AssertionError, RecursionError, TypeError) as error:
+        rest = str(error).rstrip("\n").rpartition("\n")[2]
+        raise SchemaError(f"it cannot be parsed at {rest[:60]!r}") from error
 
 
-def resolve(root: str, types: Mapping[str, list[RawField]], *, dialect: str = "ros2msg") -> Structure:
-    """Build the tree of ``root`` from flat definitions keyed by ``package/Name``.
-
-    Raises:
-        SchemaError: a type is not defined, contains itself, or exceeds `MAX_FIXED` array elements or
-            `MAX_LEAVES` fields.
-    """
-    return _Resolver({**_builtin_times(dialect), **types}).build(root, 0)
+def _resolve(name: str, messages: Sequence[Message], dialect: str = "ros2msg") -> Structure:
+    """Build the tree of a type from parsed definitions."""
+    types: dict[str, tuple[Field, ...]] = {}
+    for message in messages:
+        fields = tuple(message.fields)
+        is_empty = [field.name for field in fields] == ["structure_needs_at_least_one_member"]
+        types.setdefault(short_name(message.name), () if is_empty else fields)
+    return _Resolver(types, dialect).build(short_name(name), 0)
 
 
 class _Resolver:
-    def __init__(self, known: Mapping[str, list[RawField]]) -> None:
+    def __init__(self, known: Mapping[str, tuple[Field, ...]], dialect: str) -> None:
         self._known = known
-        self._built: dict[str, Structure] = {}
+        self._aliases = _ALIASES_ROS1 if dialect == "ros1msg" else _ALIASES
+        self._built = {} if "builtin_interfaces/Time" in known else _builtin_times(dialect)
         self._leaves: dict[str, int] = {}
         self._elements: dict[str, int] = {}
 
@@ -178,8 +172,7 @@ class _Resolver:
             raise SchemaError(f"type {name} contains itself")
         if name not in self._known:
             raise SchemaError(f"type {name} is not defined")
-        package = name.split("/", 1)[0]
-        members = tuple(self._member(field, package, depth) for field in self._known[name])
+        members = tuple(self._member(field, depth) for field in self._known[name])
         self._built[name] = Structure(name, members)
         self._measure(name, members)
         return self._built[name]
@@ -195,27 +188,34 @@ class _Resolver:
             raise SchemaError(f"type {name} has {leaves} fields of {elements} elements")
         self._leaves[name], self._elements[name] = leaves, elements
 
-    def _member(self, field: RawField, package: str, depth: int) -> Member:
-        if field.count is not None and field.count > MAX_FIXED:
-            raise SchemaError(f"field {field.name} is an array of {field.count} elements")
-        if field.type in SIZES or field.type in ("string", "wstring"):
-            return Member(field.name, field.type, field.count)
-        return Member(field.name, self.build(_full_name(field.type, package), depth + 1), field.count)
+    def _member(self, field: Field, depth: int) -> Member:
+        size = field.typ.size
+        if not 0 <= size <= MAX_FIXED:
+            raise SchemaError(f"field {field.name} is an array of {size} elements")
+        count = {Cardinality.SCALAR: None, Cardinality.SEQUENCE: SEQUENCE}.get(field.typ.cardinality, size)
+        reference = field.typ.ref
+        if isinstance(reference, BaseType):
+            plain = str(reference.name.value)
+            return Member(field.name, self._aliases.get(plain, plain), count)
+        return Member(field.name, self.build(_full_name(reference.name), depth + 1), count)
 
 
-def _full_name(type_name: str, package: str) -> str:
-    if type_name == "Header":
+def _full_name(type_name: str) -> str:
+    inner = type_name.rsplit("/", 1)[-1]
+    if inner == "Header":
         return "std_msgs/Header"
-    if type_name in ("time", "duration"):
-        return f"builtin_interfaces/{type_name.capitalize()}"
-    return short_name(type_name) if "/" in type_name else f"{package}/{type_name}"
+    if inner in ("time", "duration"):
+        return f"builtin_interfaces/{inner.capitalize()}"
+    return short_name(type_name)
 
 
-def _builtin_times(dialect: str) -> RawTypes:
+def _builtin_times(dialect: str) -> dict[str, Structure]:
     ros1 = dialect == "ros1msg"
     return {
-        f"builtin_interfaces/{name}": [RawField("sec", seconds, None), RawField("nanosec", rest, None)]
-        for name, seconds, rest in (
+        (name := f"builtin_interfaces/{kind}"): Structure(
+            name, (Member("sec", seconds, None), Member("nanosec", rest, None))
+        )
+        for kind, seconds, rest in (
             ("Time", "uint32" if ros1 else "int32", "uint32"),
             ("Duration", "int32", "int32" if ros1 else "uint32"),
         )
@@ -240,203 +240,9 @@ def contains_text(structure: Structure, kind: str) -> bool:
     )
 
 
-_HIDDEN: Final = re.compile(
-    r'(?P<string>"(?:[^"\\]|\\.)*+(?:"|\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t\r]*#[^\n]*|^IDL:[^\n]*',
-    re.MULTILINE | re.DOTALL,
-)
-"""Strings and comments; an unclosed one extends to the end of the text, so that matching is linear."""
-
-_TOKEN: Final = re.compile(r'""|\'(?:[^\'\\\n]|\\.){1,8}+\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
-_NUMBERS: Final = {
-    "boolean": "bool",
-    "octet": "uint8",
-    "char": "uint8",
-    "float": "float32",
-    "double": "float64",
-    "short": "int16",
-    "long": "int32",
-    "long long": "int64",
-    "unsigned short": "uint16",
-    "unsigned long": "uint32",
-    "unsigned long long": "uint64",
-}
-_QUALIFIERS: Final = ("unsigned", "long", "short", "double")
-
-
-def parse_idl(name: str, text: str) -> Structure:
-    """Parse concatenated IDL definitions.
-
-    Args:
-        name: type of the message, ``package/msg/Name``.
-        text: ``module``, ``struct``, ``typedef`` and ``const`` declarations; ``===`` lines separate sections.
-
-    Raises:
-        SchemaError: a declaration cannot be parsed.
-    """
-    types: RawTypes = {}
-    for section in _SEPARATOR.split(text):
-        plain = _HIDDEN.sub(lambda match: '""' if match["string"] else " ", section)
-        _Reader(_TOKEN.findall(plain), types).read_declarations([])
-    return resolve(short_name(name), types)
-
-
-class _Reader:
-    """Reads declarations into ``types``; typedefs and constants are local to their section."""
-
-    def __init__(self, tokens: list[str], types: RawTypes) -> None:
-        self._tokens = tokens
-        self._position = 0
-        self._types = types
-        self._typedefs: dict[str, tuple[str, int | None]] = {}
-        self._constants: dict[str, int] = {}
-
-    def read_declarations(self, modules: list[str]) -> None:
-        if len(modules) > MAX_DEPTH:
-            raise SchemaError(f"modules are nested more than {MAX_DEPTH} deep")
-        while self._position < len(self._tokens) and self._here() != "}":
-            word = self._next()
-            if word == "@":
-                self._skip_annotation()
-            elif word == "module":
-                inside = self._next()
-                self._expect("{")
-                self.read_declarations([*modules, inside])
-                self._expect("}")
-            elif word == "struct":
-                self._read_struct(modules)
-            elif word == "typedef":
-                self._read_typedef()
-            elif word == "const":
-                self._read_constant()
-            elif word == "enum":
-                self._read_enum()
-            elif word != ";":
-                raise SchemaError(f"the declaration {word!r} is not understood")
-
-    def _read_struct(self, modules: list[str]) -> None:
-        name = self._next()
-        self._expect("{")
-        fields: list[RawField] = []
-        while self._here() != "}":
-            if self._here() == "@":
-                self._next()
-                self._skip_annotation()
-                continue
-            kind, count = self._read_type()
-            fields += [RawField(field, kind, size) for field, size in self._read_names(count)]
-        self._expect("}")
-        if [field.name for field in fields] == ["structure_needs_at_least_one_member"]:
-            fields = []
-        self._types[short_name("/".join([*modules, name]))] = fields
-
-    def _read_typedef(self) -> None:
-        kind, count = self._read_type()
-        for name, size in self._read_names(count):
-            self._typedefs[name] = (kind, size)
-
-    def _read_constant(self) -> None:
-        self._read_type()
-        name = self._next()
-        self._expect("=")
-        value = ""
-        while self._here() != ";":
-            value += self._next()
-        if re.fullmatch(r"[0-9]+", value):
-            self._constants[name] = parse_count(value)
-
-    def _read_enum(self) -> None:
-        self._typedefs[self._next()] = ("uint32", None)
-        while self._next() != "}":
-            pass
-
-    def _read_names(self, count: int | None) -> Iterator[tuple[str, int | None]]:
-        while True:
-            name, size = self._next(), count
-            while self._here() == "[":
-                self._next()
-                length = self._number()
-                self._expect("]")
-                if count == SEQUENCE:
-                    raise SchemaError(f"{name} is an array of sequences")
-                size = length * (1 if size is None else size)
-                if size > MAX_FIXED:
-                    raise SchemaError(f"field {name} is an array of {size} elements")
-            yield name, size
-            if self._next() == ";":
-                return
-
-    def _read_type(self) -> tuple[str, int | None]:
-        word = self._next()
-        if word == "sequence":
-            self._expect("<")
-            if self._here() == "sequence":
-                raise SchemaError("a sequence of sequences is not understood")
-            kind, count = self._read_type()
-            if count is not None:
-                raise SchemaError("a sequence of arrays is not understood")
-            self._skip_bound()
-            return kind, SEQUENCE
-        if word in ("string", "wstring"):
-            if self._here() == "<":
-                self._next()
-                self._skip_bound()
-            return word, None
-        if word in SIZES:
-            return word, None
-        while word.split()[-1] in _QUALIFIERS and self._here() in _QUALIFIERS:
-            word += f" {self._next()}"
-        if word in _NUMBERS:
-            return _NUMBERS[word], None
-        while self._here() == "::":
-            self._next()
-            word += f"::{self._next()}"
-        return self._typedefs.get(word.rsplit("::", 1)[-1], (word.replace("::", "/"), None))
-
-    def _skip_bound(self) -> None:
-        while self._next() != ">":
-            pass
-
-    def _skip_annotation(self) -> None:
-        self._next()
-        while self._position < len(self._tokens) and self._here() == "::":
-            self._next()
-            self._next()
-        if self._position < len(self._tokens) and self._here() == "(":
-            depth = 0
-            while True:
-                depth += {"(": 1, ")": -1}.get(self._next(), 0)
-                if depth == 0:
-                    return
-
-    def _number(self) -> int:
-        word = self._next()
-        if re.fullmatch(r"[0-9]+", word):
-            return parse_count(word)
-        if word in self._constants:
-            return self._constants[word]
-        raise SchemaError(f"{word!r} is not a length of an array")
-
-    def _here(self) -> str:
-        if self._position >= len(self._tokens):
-            raise SchemaError("the definition is truncated")
-        return self._tokens[self._position]
-
-    def _next(self) -> str:
-        word = self._here()
-        self._position += 1
-        return word
-
-    def _expect(self, word: str) -> None:
-        word_read = self._next()
-        if word_read != word:
-            raise SchemaError(f"{word_read!r} stands in place of {word!r}")
-
-
 # Definitions of the standard message types, for writing and for logs without definitions.
 #
 # The file ``definitions.msg`` contains them in the format of a concatenated schema.
-
-_RULE: Final = f"\n{'=' * 80}\n"
 
 
 @cache
