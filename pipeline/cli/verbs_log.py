@@ -38,6 +38,7 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import trust_named
 from pipeline.core import (
+    LONGEST_NAME,
     FigureFormat,
     SlipError,
     align_rows,
@@ -45,7 +46,9 @@ from pipeline.core import (
     format_duration,
     format_share,
     format_size,
+    name_first,
     naming_os_errors,
+    shorten,
 )
 
 if TYPE_CHECKING:
@@ -235,12 +238,14 @@ _MOST_NOTES = 3
 """Losses, and notes, that are shown by default: the others are counted."""
 _MOST_TOPICS = 10
 """Topics up to which all are shown by default: of more, those that are used."""
+_MOST_ENTRIES = 100
+"""Entries up to which all of a metadata record are shown."""
 
 
 def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     index = seen.index
     size = f"{format_size(index.size_bytes)}, {format_duration(seen.duration_s)}"
-    packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
+    packing = "compression " + (name_first([name or "none" for name in index.compressions]) or "none")
     lines = [f"log       {index.path}{'' if everything else f'    {size}'}"]
     if everything:
         lines += [
@@ -284,11 +289,9 @@ def _cut(lines: Sequence[str], *, everything: bool) -> list[str]:
 
 
 def _format_metadata(seen: Inspection) -> list[str]:
-    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
-
     return [
-        f"metadata  {name}: "
-        + ", ".join(f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items())
+        f"metadata  {shorten(name, LONGEST_NAME)}: "
+        + name_first([f"{key} = {' '.join(value.split())}" for key, value in record.items()], _MOST_ENTRIES)
         for name, record in seen.index.metadata.items()
     ]
 

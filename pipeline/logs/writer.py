@@ -45,7 +45,7 @@ def normalize_columns(
     leaves = tuple(leaf_paths(structure))
     for path in fields:
         if path not in leaves:
-            hint = f"The type has: {', '.join(leaves)}"
+            hint = f"The type has: {name_first(leaves)}"
             raise LogError("field_not_found", f"there is not a field {path}", where=where, hint=hint)
     if rows == 0:
         return {}
