@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import json as json_format
+import os
 import re
 import shlex
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -412,6 +414,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
 
 
 _QUIET_S = 30.0
+_INTERRUPTED = 130
 _CLEAR = "\x1b[H\x1b[2J"
 _LABEL = 10
 """Columns of a label on a screen, with the space after it."""
@@ -450,8 +453,9 @@ def watch(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Diagnose a recording while it is written.
 
-    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log. An address is that of a
-    Foxglove WebSocket or rosbridge server on this machine, whose messages are recorded.
+    Ends when the log is closed, with the diagnosis of the finished log, or on Ctrl-C, with what is known so
+    far. An address is that of a Foxglove WebSocket or rosbridge server on this machine, whose messages are
+    recorded.
 
     Args:
         json: print one JSON object a line instead of the screen.
@@ -470,9 +474,9 @@ def watch(  # noqa: D417 - the shared choices document themselves
         arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
         watched = Watch(path, options, arguments, quiet_for, live)
         is_screen = sys.stdout.isatty() and not json
-        stopped, reported = False, ""
+        reported = ""
         try:
-            with _stopping_on_termination():
+            with _stopping_at_once(watched):
                 for seen in watched.follow():
                     try:
                         _show(seen, page, json=json, is_screen=is_screen)
@@ -485,22 +489,33 @@ def watch(  # noqa: D417 - the shared choices document themselves
                             reported = str(error)
                             print_note(f"slip: {reported} The watch goes on.")
         except KeyboardInterrupt:
-            stopped = True
-            print_note("slip: stopped watching; this is the diagnosis of the log so far")
+            return _stop(watched, choices.results, page, json=json)
     if watched.live.problem and not watched.live.slip_mps:
         print_note(f"slip: no slip was seen: {watched.live.problem}")
-    return _conclude(watched, choices, page, json=json, stopped=stopped)
+    return _conclude(watched, choices, page, json=json)
+
+
+_LEAVE_S = 1.5
+"""Time after Ctrl-C after which a watch ends whatever is still being read [s]."""
 
 
 @contextlib.contextmanager
-def _stopping_on_termination() -> Iterator[None]:
-    """Let SIGTERM end a watch as Ctrl-C does, as service managers stop programs by it."""
+def _stopping_at_once(watched: Watch) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM, by which service managers stop programs, end a watch within two seconds."""
+
+    def leave() -> None:
+        watched.close()
+        # As after a kill, what was stored is intact.
+        os._exit(_INTERRUPTED)
 
     def stop(*_: object) -> None:
+        leaving = threading.Timer(_LEAVE_S, leave)
+        leaving.daemon = True
+        leaving.start()
         raise KeyboardInterrupt
 
     try:
-        before = signal.signal(signal.SIGTERM, stop)
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     except ValueError:
         # Only the main thread has signals.
         yield
@@ -508,7 +523,30 @@ def _stopping_on_termination() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(watched: Watch, results: Path, page: Path | None, *, json: bool) -> int:
+    """Say what is known so far: judging the whole log takes longer than somebody waits who presses Ctrl-C."""
+    from pipeline.cli.screen import format_watch, list_statements  # noqa: PLC0415 - heavy
+    from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
+
+    seen = watched.to_json()
+    lines = format_watch(seen)
+    following = f"slip diagnose {shlex.quote(str(watched.path))}"
+    print_note(f"slip: stopped watching; this is what was known so far, {following} judges the whole log")
+    if json:
+        alarms = cast("Content", seen["knowledge"]).get("alarms") or []
+        answer = {"kind": "final", "stopped": True, "alarms": alarms, "runs": [], "errors": [], **seen}
+        sys.stdout.write(json_format.dumps(answer, allow_nan=False) + "\n")
+    else:
+        print_lines(lines)
+    sys.stdout.flush()
+    if page is not None:
+        _write_page(page, lines, is_live=False)
+    write_statement(results, watched.path, list_statements(seen), ended=True)
+    return CLEAN
 
 
 def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
@@ -540,7 +578,7 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
         replace_file(page, text.encode())
 
 
-def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
+def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool) -> int:
     """Diagnose the whole log, as `slip diagnose` does."""
     from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
     from pipeline.cli.verbs_effects import Diagnosed, diagnose_logs  # noqa: PLC0415 - heavy
@@ -555,7 +593,7 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     lines += [f"alarm     {alarm['text']}" for alarm in alarms]
     rows = [("", line) for line in lines]
     if json:
-        answer = {"kind": "final", "stopped": stopped, "alarms": alarms, **diagnosed.to_json()}
+        answer = {"kind": "final", "stopped": False, "alarms": alarms, **diagnosed.to_json()}
         sys.stdout.write(json_format.dumps(answer) + "\n")
         rows = list_statements(watched.to_json())
     else:
@@ -563,6 +601,5 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     if page is not None:
         _write_page(page, lines, is_live=False)
     write_statement(choices.results, watched.path, rows, ended=True)
-    if not stopped:
-        watched.forget()
+    watched.forget()
     return diagnosed.end(quiet=False)

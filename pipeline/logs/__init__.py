@@ -308,7 +308,8 @@ class TransformBuffer:
             others = sorted({link.parent for link in chosen} - {parent})
             if others:
                 self._notes.append(
-                    f"{shorten(child)} has several parents; {shorten(parent)} was taken, not {name_first(others)}"
+                    f"{shorten(child)} has several parents; {shorten(parent)} was taken, "
+                    f"not {name_first(others)}"
                 )
             if invalid[child]:
                 self._notes.append(f"{invalid[child]} transforms of {child} are invalid and were left out")

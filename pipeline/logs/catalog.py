@@ -274,6 +274,7 @@ def _list_known(times: Iterable[int | None]) -> list[int]:
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
 
+
 class DataSection:
     """Check of the checksum of a file's data section, computed once and in parallel with reading.
 

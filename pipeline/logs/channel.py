@@ -329,9 +329,7 @@ class ObjectDecoder:
         """Values of one path. What is of another kind than in most messages is missing, as null is."""
         there = [row for row in rows if row in read.values]
         several = 2 * sum(row in read.several for row in there) > len(there)
-        lists = [
-            read.values.get(row, []) if (row in read.several) == several else [] for row in rows
-        ]
+        lists = [read.values.get(row, []) if (row in read.several) == several else [] for row in rows]
         kinds = Counter(map(_name_kind, itertools.chain.from_iterable(lists)))
         del kinds[""]
         # Of equally many a number: all that is used of a message are numbers, but for names.

@@ -150,9 +150,7 @@ class LogIndex:
     @property
     def deployment(self) -> dict[str, str]:
         """Metadata record ``deployment`` (vehicle, terrain), with its values shortened."""
-        return {
-            key: shorten(text, LONGEST_NAME) for key, text in self.metadata.get("deployment", {}).items()
-        }
+        return {key: shorten(text, LONGEST_NAME) for key, text in self.metadata.get("deployment", {}).items()}
 
     @property
     def is_simulated(self) -> bool:

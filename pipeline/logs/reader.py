@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, group_by, map_in_order, name_first, shorten, usable_threads
+from pipeline.core import Ints, group_by, map_in_order, name_first, usable_threads
 from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
@@ -38,6 +38,7 @@ from pipeline.logs.part import count_fetched, hash_sources, open_source
 from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
 from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
+
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
@@ -425,9 +426,7 @@ def _find_repeated(
     return repeated
 
 
-def _finish(
-    job: _Job, repeated: Mapping[int, Ints], *, skip_unfit: bool
-) -> tuple[TopicColumns, list[Loss]]:
+def _finish(job: _Job, repeated: Mapping[int, Ints], *, skip_unfit: bool) -> tuple[TopicColumns, list[Loss]]:
     repeated_rows = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
     log_time, publish_time, rows = job.buffer.finish(repeated_rows)
     leaves: dict[str, Column] = {}
@@ -448,7 +447,7 @@ def _finish(
         losses.append(Loss(rejected.kind, text, rejected.bytes, 0, start, end))
     for field_path, count in job.recipe.decoder.shortened.items():
         text = (
-            f"{count} strings in {shorten(field_path)} of {job.info.topic} are longer than {MAX_TEXT} bytes: cut there"
+            f"{count} strings in {field_path} of {job.info.topic} are longer than {MAX_TEXT} bytes: cut there"
         )
         losses.append(Loss("long_string", text))
     columns = TopicColumns(

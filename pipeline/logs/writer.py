@@ -13,7 +13,7 @@ from typing import BinaryIO, Final, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Ints, group_rows
+from pipeline.core import Flags, Ints, group_rows, name_first
 from pipeline.logs.cdr import RowBuffer, RowWriter
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.decode import Leaf, plan_fields, wanted_leaves

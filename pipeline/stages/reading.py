@@ -227,7 +227,7 @@ def _fields_of(source: DriveSource | PoseSource, types: dict[str, str]) -> list[
 
 
 def _list_optional(source: DriveSource | PoseSource, types: dict[str, str]) -> list[Signal]:
-    """Fields that a topic in this role may lack, as messages of JSON do: height, sideways speed, frames, ..."""
+    """Fields that a topic in this role may lack, as JSON messages do: height, sideways speed, frames."""
     if isinstance(source, DriveSource):
         sideways = sideways_field(source, types)
         return [] if sideways is None else [sideways]
