@@ -19,7 +19,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.analysis import STAGE_WORDS, Options
-from pipeline.core import INPUTS, SlipError, limit_memory, measure_memory
+from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, limit_memory, measure_memory, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
@@ -149,7 +149,11 @@ def explain_logs(title: str, logs: Iterable[tuple[str, str, str]]) -> list[str]:
     lines = [
         text
         for path, reason, hint in logs
-        for text in (f"  {path}", f"      {reason}", *([f"      {hint}"] if hint else []))
+        for text in (
+            f"  {path}",
+            f"      {shorten(reason, LONGEST_TEXT)}",
+            *([f"      {hint}"] if hint else []),
+        )
     ]
     return ["", title, *lines] if lines else []
 

@@ -139,6 +139,8 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> Sequence[TopicColumns]:
         return ()
 
 
+_MOST_UNFIT = 5
+"""Topics without a needed field that are left out of a log: each costs a reading of the others."""
 _STAND_INS: Mapping[str, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "autoware_auto_control_msgs/", "hunter_msgs/")
 
@@ -196,7 +198,7 @@ class Choice:
 
 
 def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:
-    """Choose vehicle and topics of a log.
+    """Choose vehicle and topics of a log; topics whose messages never have a needed field are left out.
 
     Args:
         index: index of the log.
@@ -208,15 +210,40 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
             fitted; several robots.
         LogError: the log cannot be read.
     """
-    where = str(index.path)
-    named = [
+    named = _list_named(configuration)
+    findings: list[Finding] = []
+    while True:
+        try:
+            chosen = _choose_readable(index, configuration, overrides)
+        except LogError as error:
+            # Of some encodings, only the messages tell which fields there are.
+            topic = next((one for one in index.topics() if error.where == f"{index.path}, topic {one}"), None)
+            is_wanted = topic in named or len(findings) == _MOST_UNFIT
+            if error.code != "field_not_found" or topic is None or is_wanted:
+                raise
+            text = f"{topic} is left out: {error.what}"
+            findings.append(Finding("topic_left_out", "warning", text, where=topic))
+            index = replace(index, channels=tuple(one for one in index.channels if one.topic != topic))
+        else:
+            return replace(chosen, findings=(*findings, *chosen.findings))
+
+
+def _list_named(configuration: Configuration) -> list[str]:
+    """Topics that the configuration names."""
+    topics = (
         configuration.pose.topic,
         *list_topics(configuration.command),
         *list_topics(configuration.wheels),
-    ]
-    recognized = recognize_vehicle(
-        index.channels, index.metadata, find_description(index), [topic for topic in named if topic]
     )
+    return [topic for topic in topics if topic]
+
+
+def _choose_readable(
+    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]
+) -> Choice:
+    where = str(index.path)
+    named = _list_named(configuration)
+    recognized = recognize_vehicle(index.channels, index.metadata, find_description(index), named)
     controller = find_controller(index)
     known: dict[str, float] = {}
     if recognized is None:
