@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import return_freed_memory
+from pipeline.core import name_first, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -340,8 +340,6 @@ def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configu
 MOST_POSES = 40
 """Maximum number of poses whose content is compared: each costs a reading of the drive's topics, too, and the
 platforms of `pipeline/simulate/platforms` record at most ten."""
-_NAMED = 5
-"""Maximum number of topics that a finding names."""
 
 
 def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[list[PoseSource], Finding]:
@@ -439,9 +437,8 @@ def _leave_out_silent(
         return channels, sources, []
     silent = list(dict.fromkeys(one.signals[0].topic for one in texts))
     silent = [topic for topic in silent if topic not in readable]
-    named = ", ".join(silent[:_NAMED]) + (f" and {len(silent) - _NAMED} more" if silent[_NAMED:] else "")
     subject = "the topic was" if len(silent) == 1 else "the topics were"
-    text = f"no message of {named} is a readable command: {subject} left out"
+    text = f"no message of {name_first(silent)} is a readable command: {subject} left out"
     unread = set(silent)
     channels = [channel for channel in channels if channel.topic not in unread]
     sources = choose_sources(channels, configuration, vehicle, where=str(index.path))

@@ -282,7 +282,7 @@ def test_a_query_that_runs_on_is_ended(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(bags, "_CPU_S", 0.2)
     path = tmp_path / "run.db3"
     with sqlite3.connect(path) as database:
-        rows = f"{ENDLESS} SELECT id, 1 AS topic_id, id AS timestamp, '' AS data FROM n"
+        rows = f"{ENDLESS} SELECT id, 1 AS topic_id, id AS timestamp, '' AS data FROM n"  # noqa: S608 - likewise
         table = "CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data, content=endless, "
         try:
             database.executescript(f"{TOPICS} CREATE VIEW endless AS {rows}; {table} content_rowid=id);")
