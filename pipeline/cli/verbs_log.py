@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json as json_format
-import os
 import re
 import shlex
 import signal
 import sys
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -414,7 +412,6 @@ def stage(  # noqa: D417 - the shared choices document themselves
 
 
 _QUIET_S = 30.0
-_INTERRUPTED = 130
 _CLEAR = "\x1b[H\x1b[2J"
 _LABEL = 10
 """Columns of a label on a screen, with the space after it."""
@@ -460,34 +457,36 @@ def watch(  # noqa: D417 - the shared choices document themselves
     Args:
         json: print one JSON object a line instead of the screen.
     """
-    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-    from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
-    from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
-
-    options = build_options(choices)
-    address = parse_address(str(log))
+    watching: list[Watch] = []
     with contextlib.ExitStack() as receiving:
+        receiving.enter_context(_stopping_at_once(watching))
+        from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
+        from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
+        from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
+
+        options = build_options(choices)
+        address = parse_address(str(log))
         live = None
         if address is not None:
             live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
         path = choose_recording(log) if live is None else live.path
         arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
         watched = Watch(path, options, arguments, quiet_for, live)
+        watching.append(watched)
         is_screen = sys.stdout.isatty() and not json
         reported = ""
         try:
-            with _stopping_at_once(watched):
-                for seen in watched.follow():
-                    try:
-                        _show(seen, page, json=json, is_screen=is_screen)
-                        write_statement(choices.results, path, list_statements(seen))
-                    except BrokenPipeError:
-                        raise
-                    except (SlipError, OSError) as error:
-                        # A disk may be full or a folder gone: the recording is worth more than what is shown.
-                        if str(error) != reported:
-                            reported = str(error)
-                            print_note(f"slip: {reported} The watch goes on.")
+            for seen in watched.follow():
+                try:
+                    _show(seen, page, json=json, is_screen=is_screen)
+                    write_statement(choices.results, path, list_statements(seen))
+                except BrokenPipeError:
+                    raise
+                except (SlipError, OSError) as error:
+                    # A disk may be full or a folder gone: the recording is worth more than what is shown.
+                    if str(error) != reported:
+                        reported = str(error)
+                        print_note(f"slip: {reported} The watch goes on.")
         except KeyboardInterrupt:
             return _stop(watched, choices.results, page, json=json)
     if watched.live.problem and not watched.live.slip_mps:
@@ -495,23 +494,20 @@ def watch(  # noqa: D417 - the shared choices document themselves
     return _conclude(watched, choices, page, json=json)
 
 
-_LEAVE_S = 1.5
+_LEAVE_S = 1.8
 """Time after Ctrl-C after which a watch ends whatever is still being read [s]."""
 
 
 @contextlib.contextmanager
-def _stopping_at_once(watched: Watch) -> Iterator[None]:
+def _stopping_at_once(watching: Sequence[Watch]) -> Iterator[None]:
     """Let Ctrl-C and SIGTERM, by which service managers stop programs, end a watch within two seconds."""
 
-    def leave() -> None:
-        watched.close()
-        # As after a kill, what was stored is intact.
-        os._exit(_INTERRUPTED)
-
     def stop(*_: object) -> None:
-        leaving = threading.Timer(_LEAVE_S, leave)
-        leaving.daemon = True
-        leaving.start()
+        # The system ends the process then, whatever it does. As after a kill, what was stored is intact.
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, _LEAVE_S)
+        for watched in watching:
+            watched.close()
         raise KeyboardInterrupt
 
     try:
