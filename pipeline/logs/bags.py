@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import struct
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from io import BufferedReader, BytesIO, FileIO
+from io import BufferedReader, FileIO
 from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import quote
@@ -361,25 +362,50 @@ class _RosBag:
         return stored
 
 
+_WORD: Final = struct.Struct("<I")
+_TIME: Final = struct.Struct("<II")
+_CONNECTION, _MESSAGE = b"\x07", b"\x02"
+
+_LONGEST_HEADER: Final = 1 << 16
+"""Maximum size of the header of a record [bytes]: it holds numbers, and the name of a topic."""
+
+_MOST_BETWEEN: Final = 100
+"""Maximum number of records of connections in front of a message."""
+
+
+def _parse_header(content: bytes, offset: int) -> tuple[dict[bytes, bytes], int]:
+    """Fields of the header of a record, and where it ends."""
+    (size,) = _WORD.unpack_from(content, offset)
+    if size > _LONGEST_HEADER:
+        raise InflateError("the header of a record is longer than any")
+    place, end = offset + _WORD.size, offset + _WORD.size + size
+    fields: dict[bytes, bytes] = {}
+    while place < end:
+        (length,) = _WORD.unpack_from(content, place)
+        place += _WORD.size + length
+        name, _, value = content[place - length : place].partition(b"=")
+        fields[name] = value
+    return fields, end
+
+
 def _read_message(content: bytes, offset: int, number: int, at: int) -> bytes:
     """Content of the message at an offset of a chunk.
 
     Raises:
         InflateError: there is another record, or none.
     """
-    from rosbags.rosbag1.reader import Header, RecordType, read_bytes, read_uint32  # noqa: PLC0415 - likewise
-
-    stream = BytesIO(content)
-    stream.seek(offset)
-    header = Header.read(stream)
-    # The record of a connection stands before its first message.
-    while header.get_uint8("op") == RecordType.CONNECTION:
-        stream.seek(read_uint32(stream), os.SEEK_CUR)
-        header = Header.read(stream)
-    found = header.get_uint8("op"), header.get_uint32("conn"), header.get_time("time")
-    if found != (RecordType.MSGDATA, number, at):
+    wanted = _MESSAGE, _WORD.pack(number), _TIME.pack(*divmod(at, 10**9))
+    for _ in range(_MOST_BETWEEN):
+        fields, place = _parse_header(content, offset)
+        (size,) = _WORD.unpack_from(content, place)
+        offset = place + _WORD.size + size
+        if fields.get(b"op") != _CONNECTION:
+            break
+    if tuple(map(fields.get, (b"op", b"conn", b"time"))) != wanted:
         raise InflateError("the index names a message that is not there")
-    return read_bytes(stream, read_uint32(stream))
+    if offset > len(content):
+        raise InflateError("a message is longer than its chunk")
+    return content[offset - size : offset]
 
 
 def _join_losses(losses: Sequence[Loss]) -> list[Loss]:
