@@ -249,15 +249,15 @@ def _open_tolerant(path: Path, broken: set[int]) -> Reader:
 
         def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
             """Entries of the next index record of a chunk, unless it is damaged, or one before it."""
-            found: dict[int, list[IndexData]] = defaultdict(list)
+            read: dict[int, list[IndexData]] = defaultdict(list)
             if pos in broken:
                 return
             try:
-                super().read_index_data(pos, found)
+                super().read_index_data(pos, read)
             except Exception:  # noqa: BLE001 - likewise
                 broken.add(pos)
                 return
-            for number, entries in found.items():
+            for number, entries in read.items():
                 indexes[number] += entries
 
     bag = Tolerant(_BoundedPath(path))
@@ -378,12 +378,12 @@ def _parse_header(content: bytes, offset: int) -> tuple[dict[bytes, bytes], int]
     (size,) = _WORD.unpack_from(content, offset)
     if size > _LONGEST_HEADER:
         raise InflateError("the header of a record is longer than any")
-    place, end = offset + _WORD.size, offset + _WORD.size + size
+    position, end = offset + _WORD.size, offset + _WORD.size + size
     fields: dict[bytes, bytes] = {}
-    while place < end:
-        (length,) = _WORD.unpack_from(content, place)
-        place += _WORD.size + length
-        name, _, value = content[place - length : place].partition(b"=")
+    while position < end:
+        (length,) = _WORD.unpack_from(content, position)
+        position += _WORD.size + length
+        name, _, value = content[position - length : position].partition(b"=")
         fields[name] = value
     return fields, end
 
@@ -396,9 +396,9 @@ def _read_message(content: bytes, offset: int, number: int, at: int) -> bytes:
     """
     wanted = _MESSAGE, _WORD.pack(number), _TIME.pack(*divmod(at, 10**9))
     for _ in range(_MOST_BETWEEN):
-        fields, place = _parse_header(content, offset)
-        (size,) = _WORD.unpack_from(content, place)
-        offset = place + _WORD.size + size
+        fields, position = _parse_header(content, offset)
+        (size,) = _WORD.unpack_from(content, position)
+        offset = position + _WORD.size + size
         if fields.get(b"op") != _CONNECTION:
             break
     if tuple(map(fields.get, (b"op", b"conn", b"time"))) != wanted:

@@ -275,8 +275,8 @@ class ObjectDecoder:
                 continue
             for path, values, several in leaves:
                 if (read := self._find(path)) is not None:
-                    kept = [None if value is None else self._bound(path, value) for value in values]
-                    read.values.setdefault(row, []).extend(kept)
+                    bounded = [None if value is None else self._bound(path, value) for value in values]
+                    read.values.setdefault(row, []).extend(bounded)
                     if several:
                         read.several.add(row)
         if wrong:
