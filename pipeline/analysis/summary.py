@@ -27,7 +27,7 @@ from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store, StoreError, load_man
 
 _Packages = Mapping[str, tuple[str, ...]]
 _ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
-_CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("rosbags", "lz4"), SQLITE_BAG: ("rosbags", "apsw")}
+_CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("rosbags", "lz4"), SQLITE_BAG: ()}
 _COMPRESSION: _Packages = {"zstd": ("zstandard",), "lz4": ("pyarrow",)}
 _ENCODING: _Packages = {"protobuf": ("mcap", "mcap-protobuf-support")}
 

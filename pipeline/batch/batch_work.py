@@ -21,7 +21,16 @@ import msgspec
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.core import SlipError, end_with, limit_memory, objects_in, read_memory, silence_warnings
+from pipeline.core import (
+    LONGEST_TEXT,
+    SlipError,
+    end_with,
+    limit_memory,
+    objects_in,
+    read_memory,
+    shorten,
+    silence_warnings,
+)
 from pipeline.logs import FETCHED
 from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Mirror, Store, StoreError, stored_contexts
 
@@ -234,13 +243,13 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 def _format_losses(outcome: Outcome) -> str:
     losses = objects_in(stored_contexts(outcome.manifest).get("extract", {}), "losses")
-    return "; ".join(str(loss.get("text")) for loss in losses)
+    return shorten("; ".join(str(loss.get("text")) for loss in losses), LONGEST_TEXT)
 
 
 def _note_surprise(entry: Entry, error: BaseException) -> Entry:
     """Entry of an unforeseen error, with its location in the program."""
     last = traceback.extract_tb(error.__traceback__)[-1]
-    text = " ".join(str(error).split()) or "no message"
+    text = shorten(" ".join(str(error).split()), LONGEST_TEXT) or "no message"
     return replace(
         entry,
         code="unexpected_error",

@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -20,7 +21,7 @@ from cyclopts.types import PositiveFloat
 
 from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.batch import parse_memory_limit, parse_size
-from pipeline.core import INPUTS, SlipError, limit_memory, measure_memory
+from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, limit_memory, measure_memory, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
@@ -41,6 +42,7 @@ _UNPRINTABLE = re.compile(
 
 # Start of a field; width of the narrowest screen to fold for; largest indentation of continuation lines.
 _FIELD = re.compile(r"(?:^|(?<=  ))\S")
+_UNIT = re.compile(r"(?<=\d) (?=[^\W\d]|%)")  # the space between a number and its unit
 _NARROWEST = 40
 _DEEPEST = 38
 _HANG = 10  # of a row whose second field is far to the right, as wide as the labels of a summary
@@ -79,28 +81,25 @@ def fold_line(line: str, width: int) -> list[str]:
     """A line in parts of at most `width` columns, each below the field that it goes on with.
 
     Fields stand two spaces or more apart. What begins in the right half goes to the next line as a whole; a
-    longer text is broken between its words. A single word that is too long stays as it is.
+    longer text is broken between its words, but not between a number and its unit. A single word that is too
+    long stays as it is.
     """
     if width < _NARROWEST or len(line) <= width or line.startswith(_COPIED):
         return [line]
     starts = [match.start() for match in _FIELD.finditer(line)]
     near = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
     later = [start for start in starts if near[-1] < start <= width]
-    hang, cut = near[-1], later[-1] if later else _find_break(line, near[-1], width)
-    if cut <= hang:
-        cut = line.find(" ", width)
-        if cut < 0:
-            return [line]
-    rest, hang = line[cut:].strip(), hang or (_HANG if later else 0)
-    return [line[:cut].rstrip(), *fold_line(" " * hang + rest, width)] if rest else [line[:cut].rstrip()]
-
-
-def _find_break(line: str, hang: int, width: int) -> int:
-    """Position of the last space within the width; a number is not separated from its unit."""
-    last = cut = line.rfind(" ", hang, width + 1)
-    while cut > hang and line[cut - 1].isdigit():
-        cut = line.rfind(" ", hang, cut)
-    return cut if cut > hang else last
+    cut = later[-1] if later else 0
+    indent = " " * (near[-1] or (_HANG if later else 0))
+    wrapped = textwrap.wrap(
+        _UNIT.sub("\0", line[cut:]),
+        width,
+        initial_indent=indent if later else "",
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [*([line[:cut].rstrip()] if later else []), *(part.replace("\0", " ") for part in wrapped)] or [""]
 
 
 def print_json(content: Mapping[str, object]) -> None:
@@ -152,7 +151,11 @@ def explain_logs(title: str, logs: Iterable[tuple[str, str, str]]) -> list[str]:
     lines = [
         text
         for path, reason, hint in logs
-        for text in (f"  {path}", f"      {reason}", *([f"      {hint}"] if hint else []))
+        for text in (
+            f"  {path}",
+            f"      {shorten(reason, LONGEST_TEXT)}",
+            *([f"      {hint}"] if hint else []),
+        )
     ]
     return ["", title, *lines] if lines else []
 

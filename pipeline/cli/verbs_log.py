@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -39,6 +39,7 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import trust_named
 from pipeline.core import (
+    LONGEST_NAME,
     FigureFormat,
     SlipError,
     align_rows,
@@ -46,7 +47,9 @@ from pipeline.core import (
     format_duration,
     format_share,
     format_size,
+    name_first,
     naming_os_errors,
+    shorten,
 )
 
 if TYPE_CHECKING:
@@ -234,12 +237,14 @@ _MOST_NOTES = 3
 """Losses, and notes, that are shown by default: the others are counted."""
 _MOST_TOPICS = 10
 """Topics up to which all are shown by default: of more, those that are used."""
+_MOST_ENTRIES = 100
+"""Entries up to which all of a metadata record are shown."""
 
 
 def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     index = seen.index
     size = f"{format_size(index.size_bytes)}, {format_duration(seen.duration_s)}"
-    packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
+    packing = "compression " + (name_first([name or "none" for name in index.compressions]) or "none")
     lines = [f"log       {index.path}{'' if everything else f'    {size}'}"]
     if everything:
         lines += [
@@ -283,11 +288,9 @@ def _cut(lines: Sequence[str], *, everything: bool) -> list[str]:
 
 
 def _format_metadata(seen: Inspection) -> list[str]:
-    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
-
     return [
-        f"metadata  {name}: "
-        + ", ".join(f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items())
+        f"metadata  {shorten(name, LONGEST_NAME)}: "
+        + name_first([f"{key} = {' '.join(value.split())}" for key, value in record.items()], _MOST_ENTRIES)
         for name, record in seen.index.metadata.items()
     ]
 
@@ -446,57 +449,68 @@ def watch(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Diagnose a recording while it is written.
 
-    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log. An address is that of a
-    Foxglove WebSocket or rosbridge server on this machine, whose messages are recorded.
+    Ends when the log is closed, with the diagnosis of the finished log, or on Ctrl-C, with what is known so
+    far. An address is that of a Foxglove WebSocket or rosbridge server on this machine, whose messages are
+    recorded.
 
     Args:
         json: print one JSON object a line instead of the screen.
     """
-    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-    from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
-    from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
-
-    options = build_options(choices)
-    address = parse_address(str(log))
+    watching: list[Watch] = []
     with contextlib.ExitStack() as receiving:
+        receiving.enter_context(_stopping_at_once(watching))
+        from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
+        from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
+        from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
+
+        options = build_options(choices)
+        address = parse_address(str(log))
         live = None
         if address is not None:
             live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
         path = choose_recording(log) if live is None else live.path
         arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
         watched = Watch(path, options, arguments, quiet_for, live)
+        watching.append(watched)
         is_screen = sys.stdout.isatty() and not json
-        stopped, reported = False, ""
+        reported = ""
         try:
-            with _stopping_on_termination():
-                for seen in watched.follow():
-                    try:
-                        _show(seen, page, json=json, is_screen=is_screen)
-                        write_statement(choices.results, path, list_statements(seen))
-                    except BrokenPipeError:
-                        raise
-                    except (SlipError, OSError) as error:
-                        # A disk may be full or a folder gone: the recording is worth more than what is shown.
-                        if str(error) != reported:
-                            reported = str(error)
-                            print_note(f"slip: {reported} The watch goes on.")
+            for seen in watched.follow():
+                try:
+                    _show(seen, page, json=json, is_screen=is_screen)
+                    write_statement(choices.results, path, list_statements(seen))
+                except BrokenPipeError:
+                    raise
+                except (SlipError, OSError) as error:
+                    # A disk may be full or a folder gone: the recording is worth more than what is shown.
+                    if str(error) != reported:
+                        reported = str(error)
+                        print_note(f"slip: {reported} The watch goes on.")
         except KeyboardInterrupt:
-            stopped = True
-            print_note("slip: stopped watching; this is the diagnosis of the log so far")
+            return _stop(watched, choices.results, page, json=json)
     if watched.live.problem and not watched.live.slip_mps:
         print_note(f"slip: no slip was seen: {watched.live.problem}")
-    return _conclude(watched, choices, page, json=json, stopped=stopped)
+    return _conclude(watched, choices, page, json=json)
+
+
+_LEAVE_S = 1.8
+"""Time after Ctrl-C after which a watch ends whatever is still being read [s]."""
 
 
 @contextlib.contextmanager
-def _stopping_on_termination() -> Iterator[None]:
-    """Let SIGTERM end a watch as Ctrl-C does, as service managers stop programs by it."""
+def _stopping_at_once(watching: Sequence[Watch]) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM, by which service managers stop programs, end a watch within two seconds."""
 
     def stop(*_: object) -> None:
+        # The system ends the process then, whatever it does. As after a kill, what was stored is intact.
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, _LEAVE_S)
+        for watched in watching:
+            watched.close()
         raise KeyboardInterrupt
 
     try:
-        before = signal.signal(signal.SIGTERM, stop)
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     except ValueError:
         # Only the main thread has signals.
         yield
@@ -504,7 +518,30 @@ def _stopping_on_termination() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(watched: Watch, results: Path, page: Path | None, *, json: bool) -> int:
+    """Say what is known so far: judging the whole log takes longer than somebody waits who presses Ctrl-C."""
+    from pipeline.cli.screen import format_watch, list_statements  # noqa: PLC0415 - heavy
+    from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
+
+    seen = watched.to_json()
+    lines = format_watch(seen)
+    following = f"slip diagnose {shlex.quote(str(watched.path))}"
+    print_note(f"slip: stopped watching; this is what was known so far, {following} judges the whole log")
+    if json:
+        alarms = cast("Content", seen["knowledge"]).get("alarms") or []
+        answer = {"kind": "final", "stopped": True, "alarms": alarms, "runs": [], "errors": [], **seen}
+        sys.stdout.write(json_format.dumps(answer, allow_nan=False) + "\n")
+    else:
+        print_lines(lines)
+    sys.stdout.flush()
+    if page is not None:
+        _write_page(page, lines, is_live=False)
+    write_statement(results, watched.path, list_statements(seen), ended=True)
+    return CLEAN
 
 
 def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
@@ -536,7 +573,7 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
         replace_file(page, text.encode())
 
 
-def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
+def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool) -> int:
     """Diagnose the whole log, as `slip diagnose` does."""
     from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
     from pipeline.cli.verbs_effects import Diagnosed, diagnose_logs  # noqa: PLC0415 - heavy
@@ -550,7 +587,7 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     lines += [f"alarm     {alarm['text']}" for alarm in alarms]
     rows = [("", line) for line in lines]
     if json:
-        answer = {"kind": "final", "stopped": stopped, "alarms": alarms, **diagnosed.to_json()}
+        answer = {"kind": "final", "stopped": False, "alarms": alarms, **diagnosed.to_json()}
         sys.stdout.write(json_format.dumps(answer) + "\n")
         rows = list_statements(watched.to_json())
     else:
@@ -558,6 +595,5 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     if page is not None:
         _write_page(page, lines, is_live=False)
     write_statement(choices.results, watched.path, rows, ended=True)
-    if not stopped:
-        watched.forget()
+    watched.forget()
     return diagnosed.end(quiet=False)

@@ -90,6 +90,8 @@ if TYPE_CHECKING:
         INPUT_WORDS,
         INPUTS,
         JSON_DIGITS,
+        LONGEST_NAME,
+        LONGEST_TEXT,
         NORMAL_95,
         TREND_THRESHOLD,
         FigureFormat,

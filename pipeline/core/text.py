@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any, Literal, TypeVar, get_args
 
 Key = TypeVar("Key")
@@ -10,8 +11,12 @@ Item = TypeVar("Item")
 
 _READABLE = 300
 """Maximum number of characters of quoted text in a sentence: four lines of a screen."""
-_LONGEST = 1000
-"""Maximum number of characters of an error, which may quote a text of any size from a file."""
+LONGEST_NAME = 200
+"""Maximum number of characters of a name from a file in tables and sentences."""
+LONGEST_TEXT = 1000
+"""Maximum number of characters of an error or a loss, which may quote a text of any size from a file."""
+_FEW = 8
+"""Number of names up to which a sentence lists all: about two lines of a screen."""
 
 
 class SlipError(Exception):
@@ -28,9 +33,9 @@ class SlipError(Exception):
         super().__init__(what)
         self.code = code
         # Errors quote files, whose texts may have any length.
-        self.what = shorten(what, _LONGEST)
+        self.what = shorten(what, LONGEST_TEXT)
         self.where = where
-        self.hint = hint
+        self.hint = shorten(hint, LONGEST_TEXT)
 
     def __str__(self) -> str:
         """One line: where, what, what to do."""
@@ -47,8 +52,8 @@ class SlipError(Exception):
 
 
 def shorten(text: str, most: int = _READABLE) -> str:
-    """A text, truncated if it is long."""
-    return text if len(text) <= most else f"{text[:most]}..."
+    """A text; of a long one the first ``most`` characters, and how many it has."""
+    return text if len(text) <= most else f"{text[:most]}... (cut, of {len(text):,} characters)"
 
 
 def make_plain(text: str) -> str:
@@ -149,9 +154,16 @@ def enumerate_texts(texts: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
-def name_first(names: Sequence[str], most: int = 4) -> list[str]:
-    """Names; of more than so many the first ones, and how many others."""
-    return [*names] if len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
+def name_first(names: Collection[str], most: int = _FEW) -> str:
+    """Names as a list in a sentence, long ones shortened: `a, b and c`, or `a, b and 41,000 more`.
+
+    Args:
+        names: what is listed, such as topics, types, frames or fields.
+        most: number up to which all are listed; of more the first ones are.
+    """
+    shown = len(names) if len(names) <= most else most - 1
+    first = [shorten(name, LONGEST_NAME) for name in islice(names, shown)]
+    return enumerate_texts(first if shown == len(names) else [*first, f"{len(names) - shown:,} more"])
 
 
 def format_digits(value: float, digits: int = 2) -> str:

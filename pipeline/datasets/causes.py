@@ -149,7 +149,7 @@ class Difference:
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
         )
-        rest = f"; no contribution: {', '.join(name_first(none))}" if none else ""
+        rest = f"; no contribution: {name_first(none)}" if none else ""
         return f"{start}: {words}{rest}{end}"
 
     def describe_tests(self, names: Mapping[str, str]) -> str:

@@ -199,7 +199,7 @@ def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedR
 
 def _note_left_out(reason: str, runs: Sequence[str]) -> str:
     count = f" ({len(runs)} runs)" if len(runs) > 1 else ""
-    return f"left out, {reason}{count}: {', '.join(name_first(runs))}"
+    return f"left out, {reason}{count}: {name_first(runs)}"
 
 
 def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:

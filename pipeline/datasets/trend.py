@@ -586,11 +586,10 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
         f"{one.label} of {one.vehicle} stands apart in {', '.join(one.odd)}" for one in parameters if one.odd
     ]
     notes += [
-        f"{', '.join(name_first(labels))} of {vehicle}, left out where a run does not determine it: "
-        f"{', '.join(runs)}"
+        f"{name_first(labels)} of {vehicle}, left out where a run does not determine it: {', '.join(runs)}"
         for (vehicle, runs), labels in lost.items()
     ]
-    return [*notes, *(f"{', '.join(name_first(labels))} of {need}" for need, labels in needs.items())]
+    return [*notes, *(f"{name_first(labels)} of {need}" for need, labels in needs.items())]
 
 
 def summarize_trend(trend: Trend) -> dict[str, object]:

@@ -555,7 +555,7 @@ def choose_input(
     """
     known = tuple(effects)
     drivetrain = tuple(dict.fromkeys(effect.id for effect in known if effect.place <= Place.DRIVE))
-    names = ", ".join(name_first(drivetrain))
+    names = name_first(drivetrain)
     acts = f"{names} {'act' if len(drivetrain) > 1 else 'acts'} between command and wheels"
     silent = next((run.name for run in runs if run.commands is None), None)
     if asked is not None:

@@ -45,7 +45,8 @@ class LiveStatement(msgspec.Struct, kw_only=True):
         log: the recording.
         rows: label and text of each row; a row without a label continues the previous one.
         time: time of the output [s since 1970].
-        ended: whether the watch has ended; the rows are then the diagnosis of the whole recording.
+        ended: whether the watch has ended; the rows are then the diagnosis of the whole recording, or what
+            was known when it was stopped.
     """
 
     log: str
@@ -250,7 +251,7 @@ class Watch:
                         return
                     time.sleep(_POLL_S)
             finally:
-                self._end()
+                self.close()
 
     def _refuse_still(self) -> None:
         """Raise an error if the log is empty and not being written."""
@@ -415,13 +416,13 @@ class Watch:
             "cpu_share": round((measure_cpu() - self._cpu + self._log.cpu_s) / wall, 3),
         }
 
-    def _end(self) -> None:
+    def close(self) -> None:
         """Stop a running diagnosis."""
-        if self._diagnosing is not None:
+        running, self._diagnosing = self._diagnosing, None
+        if running is not None:
             with suppress(ProcessLookupError):
-                os.killpg(self._diagnosing.process.pid, signal.SIGKILL)
-            self._diagnosing.process.wait()
-            self._diagnosing = None
+                os.killpg(running.process.pid, signal.SIGKILL)
+            running.process.wait()
 
     def forget(self) -> None:
         """Delete the stored knowledge of the growing log, which now has its final diagnosis."""

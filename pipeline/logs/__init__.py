@@ -25,7 +25,9 @@ from pipeline.core import (
     invert_quaternions,
     measure_increments,
     multiply_quaternions,
+    name_first,
     rotate,
+    shorten,
 )
 from pipeline.logs.catalog import OVER_BUDGET
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings, join_times
@@ -37,7 +39,6 @@ from pipeline.logs.index import (
     hash_log,
     list_files,
     open_log,
-    shorten,
     stem_of,
 )
 from pipeline.logs.part import is_finished
@@ -287,7 +288,7 @@ class TransformBuffer:
             if unknown
             else f"no chain of transforms leads from {parent} to {child}"
         )
-        hint = f"Known frames: {', '.join(frames)}" if frames else "The log holds no transforms"
+        hint = f"Known frames: {name_first(frames)}" if frames else "The log holds no transforms"
         return LogError("frame_not_found", what, hint=hint)
 
     def _collect(self, topics: list[TopicColumns]) -> None:
@@ -307,7 +308,8 @@ class TransformBuffer:
             others = sorted({link.parent for link in chosen} - {parent})
             if others:
                 self._notes.append(
-                    f"{child} has several parents; {parent} was taken, not {', '.join(others)}"
+                    f"{shorten(child)} has several parents; {shorten(parent)} was taken, "
+                    f"not {name_first(others)}"
                 )
             if invalid[child]:
                 self._notes.append(f"{invalid[child]} transforms of {child} are invalid and were left out")

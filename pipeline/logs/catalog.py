@@ -8,7 +8,7 @@ from typing import Final
 
 from mcap.records import Channel, Schema
 
-from pipeline.core import format_size
+from pipeline.core import format_size, name_first
 from pipeline.logs.chunks import largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
@@ -274,9 +274,6 @@ def _list_known(times: Iterable[int | None]) -> list[int]:
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
 
-_LISTED: Final = 12
-"""Maximum number of topics listed in a message."""
-
 
 class DataSection:
     """Check of the checksum of a file's data section, computed once and in parallel with reading.
@@ -361,9 +358,8 @@ class Coverage:
                 "damage in them cannot be seen"
             )
         if self.topics:
-            listed = ", ".join(self.topics[:_LISTED]) + (", ..." if len(self.topics) > _LISTED else "")
             said.append(
-                f"no checksum and no second copy covers what the log says of {listed}: "
+                f"no checksum and no second copy covers what the log says of {name_first(self.topics)}: "
                 "names and types of their fields may be damaged"
             )
         return "; ".join(said)

@@ -7,15 +7,16 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final, TypeAlias
 
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.records import Schema
 
-from pipeline.core import Flags, Ints
+from pipeline.core import LONGEST_NAME, Flags, Ints
 from pipeline.logs.cdr import DIALECTS, MAX_TEXT, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
 from pipeline.logs.columns import (
     STAMPS,
@@ -212,8 +213,9 @@ class ChannelBuffer:
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"
 _LARGEST_INTEGER = 1 << 63
-_MOST_CELLS = 20_000_000
-"""Maximum number of rows times fields of a topic: arbitrary field names could otherwise exhaust memory."""
+_MOST_CELLS, _CELLS_PER_VALUE = 1_000_000, 16
+"""Maximum number of rows times fields of a topic: so many, and so many for each value in its messages. Memory
+otherwise grows with the square of messages whose fields have ever new names."""
 _TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
 
 
@@ -226,26 +228,36 @@ def _name_kind(value: Leaf | None) -> str:
 
 @dataclass(slots=True)
 class _Read:
-    """What one message has under one path: several values if it is a list, or in one."""
+    """What the messages have under one path: by row, the values, and whether they are a list or in one."""
 
-    several: bool = False
-    values: list[Leaf | None] = field(default_factory=list)
+    values: dict[int, list[Leaf | None]] = field(default_factory=dict)
+    several: set[int] = field(default_factory=set)
 
 
 class ObjectDecoder:
-    """Decodes payloads one by one into nested values.
+    """Decodes payloads one by one into nested values, of which the wanted fields are kept.
 
     Args:
         decode: decodes one payload; raises ``ValueError`` on failure.
         fields: wanted paths, None for all.
+        optional: those of them that all messages may lack.
         where: topic named in errors.
     """
 
-    def __init__(self, decode: Callable[[bytes], Value], fields: Sequence[str] | None, *, where: str) -> None:
+    def __init__(
+        self,
+        decode: Callable[[bytes], Value],
+        fields: Sequence[str] | None,
+        optional: Collection[str] = (),
+        *,
+        where: str,
+    ) -> None:
         self._decode = decode
         self._fields = fields
+        self._optional = optional
         self._where = where
-        self._rows: dict[int, dict[str, _Read]] = {}
+        # None for what is not wanted: the name alone is known.
+        self._read: dict[str, _Read | None] = {}
         self.rejected: list[Rejected] = []
         self.notes: tuple[str, ...] = ()
         self.shortened: dict[str, int] = {}
@@ -256,16 +268,17 @@ class ObjectDecoder:
         spans = zip(ids.tolist(), block.start.tolist(), block.size.tolist(), strict=True)
         for position, (row, start, size) in enumerate(spans):
             try:
-                leaves: dict[str, _Read] = {}
-                for path, values, several in _walk(
-                    self._decode(block.data[start : start + size].tobytes()), "", inside=False
-                ):
-                    read = leaves.setdefault(path, _Read())
-                    read.several |= several
-                    read.values += [None if value is None else self._bound(path, value) for value in values]
-                self._rows[row] = leaves
+                value = self._decode(block.data[start : start + size].tobytes())
+                leaves = list(_walk(value, "", inside=False))
             except (ValueError, RecursionError):
                 wrong.append(position)
+                continue
+            for path, values, several in leaves:
+                if (read := self._find(path)) is not None:
+                    bounded = [None if value is None else self._bound(path, value) for value in values]
+                    read.values.setdefault(row, []).extend(bounded)
+                    if several:
+                        read.several.add(row)
         if wrong:
             lost = int(block.size[wrong].sum())
             self.rejected.append(Rejected("undecodable", "the payload cannot be parsed", ids[wrong], lost))
@@ -283,32 +296,40 @@ class ObjectDecoder:
         self.shortened[path] = self.shortened.get(path, 0) + 1
         return f"{value[:MAX_TEXT]} (cut, of {len(value)} characters)"
 
+    def _find(self, path: str) -> _Read | None:
+        """Where the values of a path are kept; None if it is not wanted."""
+        if path not in self._read:
+            is_wanted = path.startswith(STAMPS) or bool(
+                select_leaves((path,), self._fields, self._fields or (), where=self._where)
+            )
+            self._read[path] = _Read() if is_wanted else None
+        return self._read[path]
+
     def columns(self, rows: Ints) -> dict[str, Column]:
         """Columns of the given rows, in their order.
 
         Raises:
             LogError: ``field_not_found``, no message has a wanted field; ``too_many_fields``.
         """
-        messages = [self._rows[row] for row in rows.tolist()]
-        leaves = tuple(dict.fromkeys(path for message in messages for path in message))
-        if not messages:
+        if not rows.size:
             return {}
-        chosen = select_leaves(leaves, self._fields, where=self._where)
-        chosen |= {path for path in leaves if path.startswith(STAMPS)}
-        if len(chosen) * len(messages) > _MOST_CELLS:
+        select_leaves(tuple(self._read), self._fields, self._optional, where=self._where)
+        read = {path: one for path, one in self._read.items() if one is not None}
+        most = _MOST_CELLS + _CELLS_PER_VALUE * sum(len(one.values) for one in read.values())
+        if len(read) * rows.size > most:
             raise LogError(
                 "too_many_fields",
-                f"its {len(messages)} messages have {len(chosen)} different fields, which no table can hold",
+                f"its {rows.size} messages have {len(read)} different fields, which no table can hold",
                 where=self._where,
                 hint="Leave the topic out",
             )
-        return {path: self._column(path, messages) for path in leaves if path in chosen}
+        return {path: self._column(one, rows.tolist()) for path, one in read.items()}
 
-    def _column(self, path: str, messages: list[dict[str, _Read]]) -> Column:
+    def _column(self, read: _Read, rows: list[int]) -> Column:
         """Values of one path. What is of another kind than in most messages is missing, as null is."""
-        read = [message.get(path) for message in messages]
-        several = 2 * sum(one.several for one in read if one) > sum(one is not None for one in read)
-        lists = [one.values if one and one.several == several else [] for one in read]
+        there = [row for row in rows if row in read.values]
+        several = 2 * sum(row in read.several for row in there) > len(there)
+        lists = [read.values.get(row, []) if (row in read.several) == several else [] for row in rows]
         kinds = Counter(map(_name_kind, itertools.chain.from_iterable(lists)))
         del kinds[""]
         # Of equally many a number: all that is used of a message are numbers, but for names.
@@ -403,6 +424,12 @@ def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
 
 
 def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, list[Leaf | None], bool]]:
+    """Paths of the leaves with their values, and whether these are in a list.
+
+    Longer paths than any type has are left out: those of nested keys would take many times their bytes.
+    """
+    if len(path) > LONGEST_NAME:
+        return
     if isinstance(value, dict):
         for key, below in value.items():
             name = _TIMES.get(key, key) if path.endswith(("stamp", "timestamp")) else key
@@ -440,13 +467,21 @@ class Recipe:
     notes: tuple[str, ...] = ()
 
 
-def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None, *, where: str) -> Recipe:
+def decoder_for(
+    info: ChannelInfo,
+    schema: bytes,
+    fields: tuple[str, ...] | None,
+    optional: Collection[str] = (),
+    *,
+    where: str,
+) -> Recipe:
     """Choose the decoder of a channel.
 
     Args:
         info: the channel.
         schema: data of its schema.
         fields: wanted field paths, None for all.
+        optional: those of them that the channel may lack.
         where: log named in errors.
 
     Raises:
@@ -454,13 +489,13 @@ def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None
     """
     origin = f"{where}, topic {info.topic}"
     if info.message_encoding == "json":
-        return Recipe(ObjectDecoder(decode_json, fields, where=origin), ())
+        return Recipe(ObjectDecoder(decode_json, fields, optional, where=origin), ())
     if info.message_encoding == "protobuf":
         decode = protobuf_decoder(schema, info.type_name, where=origin)
-        return Recipe(ObjectDecoder(decode, fields, where=origin), ())
+        return Recipe(ObjectDecoder(decode, fields, optional, where=origin), ())
     structure, notes = _structure_of(info, schema, fields, origin)
     leaves = tuple(leaf_paths(structure))
-    chosen = select_leaves(leaves, fields, where=origin)
+    chosen = select_leaves(leaves, fields, optional, where=origin)
     chosen |= {path for path in _STAMP if path in leaves}
     return Recipe(
         StructuredDecoder(
@@ -481,7 +516,7 @@ def _structure_of(
     if info.message_encoding not in ("cdr", "ros1"):
         what = f"messages are encoded as {info.message_encoding!r}"
         raise unsupported(what, where, "Leave the topic out, or convert the log to cdr")
-    structure, reason = _parse(info, schema)
+    structure, reason = _parse(info.type_name, info.schema_encoding, schema)
     if structure is None:
         structure = bundled_structure(info.type_name) if info.message_encoding == "cdr" else None
         if structure is None and reason == _EMPTY and not fields:
@@ -495,16 +530,17 @@ def _structure_of(
     return structure, ()
 
 
-def _parse(info: ChannelInfo, schema: bytes) -> tuple[Structure | None, str]:
-    """Type defined by a schema, and an empty text; or None and the reason."""
+@lru_cache(maxsize=64)
+def _parse(type_name: str, encoding: str, schema: bytes) -> tuple[Structure | None, str]:
+    """Type defined by a schema, and an empty text; or None and the reason. Channels share schemas."""
     text = schema.decode("utf-8", "replace")
     if not text.strip():
         return None, _EMPTY
     try:
-        if info.schema_encoding == "ros2idl":
-            return parse_idl(info.type_name, text), ""
-        if info.schema_encoding in ("ros2msg", "ros1msg"):
-            return parse_msg(info.type_name, text, dialect=info.schema_encoding), ""
+        if encoding == "ros2idl":
+            return parse_idl(type_name, text), ""
+        if encoding in ("ros2msg", "ros1msg"):
+            return parse_msg(type_name, text, dialect=encoding), ""
     except SchemaError as error:
         return None, f"the definition cannot be read ({error})"
-    return None, f"the schema encoding {info.schema_encoding!r} is not known"
+    return None, f"the schema encoding {encoding!r} is not known"

@@ -363,13 +363,13 @@ class BudgetError(Exception):
 
 @dataclass(slots=True)
 class Allowance:
-    """Remaining bytes that a bag may inflate to, out of ``most``."""
+    """Remaining bytes that a bag may yield, out of ``most``: those of its chunks, or of its messages."""
 
     most: int
     remaining: int
 
     def take(self, size: int) -> None:
-        """Charge inflated bytes.
+        """Charge bytes that were produced.
 
         Raises:
             BudgetError: they exceed the limit.
@@ -377,7 +377,7 @@ class Allowance:
         self.remaining -= size
         if self.remaining < 0:
             raise BudgetError(
-                f"it decompresses to more than {format_size(self.most)}, and no more is read; "
+                f"its content is more than {format_size(self.most)}, and no more is read; "
                 "a larger --max-inflated reads more"
             )
 

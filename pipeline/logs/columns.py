@@ -5,7 +5,7 @@ concatenated values with offsets. Strings are codes into the tuple of the distin
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Final, Self, TypeAlias, TypeVar
@@ -13,7 +13,7 @@ from typing import Final, Self, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Floats, Ints
+from pipeline.core import Flags, Floats, Ints, name_first
 from pipeline.logs.chunks import MESSAGE_OVERHEAD, Messages
 from pipeline.logs.records import Buffer, LogError
 
@@ -157,12 +157,15 @@ def complete_stamps(stamp: Ints, known: Flags, log_time: Ints) -> Ints | None:
     return np.where(known, stamp, log_time + usual)
 
 
-def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where: str) -> set[str]:
+def select_leaves(
+    leaves: Sequence[str], fields: Sequence[str] | None, optional: Collection[str] = (), *, where: str
+) -> set[str]:
     """Leaf fields required by the wanted paths.
 
     Args:
         leaves: every leaf field of the type.
         fields: wanted paths, None for all.
+        optional: those of them that may be absent.
         where: topic named in errors.
 
     Raises:
@@ -173,8 +176,8 @@ def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where:
     chosen: set[str] = set()
     for wanted in fields:
         selected = _leaves_of(leaves, wanted)
-        if not selected:
-            hint = f"The type has: {', '.join(leaves)}"
+        if not selected and wanted not in optional:
+            hint = f"The type has: {name_first(leaves)}"
             raise LogError("field_not_found", f"there is not a field {wanted}", where=where, hint=hint)
         chosen.update(selected)
     return chosen

@@ -9,7 +9,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, cast
 
-from pipeline.core import PAUSE_NS, PathError, format_size, resolve_inside, usable_threads
+from pipeline.core import (
+    LONGEST_NAME,
+    PAUSE_NS,
+    PathError,
+    format_size,
+    name_first,
+    resolve_inside,
+    shorten,
+    usable_threads,
+)
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.compressed import COMPRESSED, uncompressed_name
@@ -31,10 +40,9 @@ from pipeline.logs.spans import Span
 SUFFIXES: Final = (".mcap", *(f".mcap{end}" for end in COMPRESSED), ".db3", ".bag")
 """Suffixes of the files of recordings."""
 
-_LONGEST_SHOWN: Final = 100
 _MAX_LISTING: Final = 4 << 20
-LONGEST_NAME: Final = 200
-"""Maximum length of a name from a log in tables and sentences [characters]."""
+_MOST_TOPICS: Final = 3000
+"""Maximum number of channels of a recording that are read: the fullest of real logs have hundreds."""
 LISTING: Final = "metadata.yaml"
 """File that rosbag2 writes into its folder at the end of a recording."""
 
@@ -142,7 +150,7 @@ class LogIndex:
     @property
     def deployment(self) -> dict[str, str]:
         """Metadata record ``deployment`` (vehicle, terrain), with its values shortened."""
-        return {key: shorten(text) for key, text in self.metadata.get("deployment", {}).items()}
+        return {key: shorten(text, LONGEST_NAME) for key, text in self.metadata.get("deployment", {}).items()}
 
     @property
     def is_simulated(self) -> bool:
@@ -167,13 +175,6 @@ def find_types(channels: Iterable[ChannelInfo]) -> dict[str, str]:
         if (channel.message_count or 0) >= (known.message_count or 0):
             fullest[channel.topic] = channel
     return {topic: channel.type_name for topic, channel in fullest.items()}
-
-
-def shorten(name: str) -> str:
-    """Shorten a name from a log for use in tables; a cut name states its full length."""
-    if len(name) <= LONGEST_NAME:
-        return name
-    return f"{name[:LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
 def open_log(
@@ -347,7 +348,7 @@ def _find_listed(folder: Path, name: str) -> Path | None:
 def _show(name: str) -> str:
     """Format a file name from a listing, which is untrusted, for a message."""
     plain = name.rpartition("/")[2]
-    return plain if plain.isprintable() and len(plain) <= _LONGEST_SHOWN else repr(name[:_LONGEST_SHOWN])
+    return plain if plain.isprintable() and len(plain) <= LONGEST_NAME else repr(shorten(name, LONGEST_NAME))
 
 
 def split_number(file: Path) -> tuple[str, int]:
@@ -368,8 +369,13 @@ def _listed_files(text: str) -> list[str]:
 
 
 def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: int) -> LogIndex:
-    """Merge the catalogs of the files of a recording; channels of one topic and type get one number."""
+    """Merge the catalogs of the files of a recording; channels of one topic and type get one number.
+
+    Names have at most `LONGEST_NAME` characters here, and of very many channels the first ones are taken:
+    whatever is said of a log stays readable.
+    """
     channels: dict[tuple[object, ...], ChannelInfo] = {}
+    omitted: list[str] = []
     alone = len(parts) == 1
     catalogs = [part.catalog for part in parts]
     for part in parts:
@@ -378,25 +384,36 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
             described = (schema.name, schema.data) if schema else ()
             key = (number,) if alone else (channel.topic, channel.message_encoding, *described)
             known = channels.get(key)
+            if known is None and len(channels) == _MOST_TOPICS:
+                omitted.append(channel.topic)
+                continue
             if known is None:
                 known = ChannelInfo(
                     number if alone else len(channels) + 1,
-                    channel.topic,
-                    schema.name if schema else "",
-                    schema.encoding if schema else "",
-                    channel.message_encoding,
+                    shorten(channel.topic, LONGEST_NAME),
+                    shorten(schema.name, LONGEST_NAME) if schema else "",
+                    shorten(schema.encoding, LONGEST_NAME) if schema else "",
+                    shorten(channel.message_encoding, LONGEST_NAME),
                     0,
                     dict(channel.metadata),
                 )
             count = known.message_count + part.catalog.counts.get(number, 0)
             channels[key] = replace(known, message_count=count)
             part.numbers[number] = known.id
+    if omitted:
+        text = (
+            f"the log has {len(channels) + len(omitted):,} topics: the first {len(channels):,} are read, "
+            f"and not {name_first(omitted)}"
+        )
+        losses = [*losses, Loss("too_large", text)]
     return LogIndex(
         path=path,
         size_bytes=sum(part.size_bytes for part in parts),
-        profile=catalogs[0].profile,
-        library=catalogs[0].library,
-        compressions=tuple(sorted(set().union(*(catalog.compressions for catalog in catalogs)))),
+        profile=shorten(catalogs[0].profile, LONGEST_NAME),
+        library=shorten(catalogs[0].library, LONGEST_NAME),
+        compressions=tuple(
+            sorted({shorten(name, LONGEST_NAME) for one in catalogs for name in one.compressions})
+        ),
         chunk_count=sum(catalog.count_chunks() for catalog in catalogs),
         start_ns=min((each.start_ns for each in catalogs if each.start_ns is not None), default=0),
         end_ns=max((each.end_ns for each in catalogs if each.end_ns is not None), default=0),

@@ -5,12 +5,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, group_by, map_in_order, usable_threads
+from pipeline.core import Ints, group_by, map_in_order, name_first, usable_threads
 from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
@@ -38,9 +39,6 @@ from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
 from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
 
-_LISTED: Final = 12
-"""Maximum number of topics listed in an error."""
-
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
@@ -52,11 +50,14 @@ class Wanted:
             ``transforms[].child_frame_id``; a path of a structure selects all its fields. None selects all.
         alike: by other types of the topic (``package/Name``), their own paths of the fields; channels of
             these types are read as if they were of the first.
+        optional: those of the fields that a topic may lack, such as JSON messages without them: there is no
+            column of them then.
     """
 
     topic: str
     fields: tuple[str, ...] | None = None
     alike: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    optional: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,7 +199,8 @@ def read_topics(
     losses.update(dict.fromkeys(_count_missing(counted, tuple(losses))))
     topics: list[TopicColumns] = []
     unfit: list[TopicColumns] = []
-    for columns, lost in map_in_order(lambda job: _finish(job, repeated), jobs.values(), workers):
+    finish = partial(_finish, repeated=repeated, skip_unfit=skip_unfit)
+    for columns, lost in map_in_order(finish, jobs.values(), workers):
         losses.update(dict.fromkeys(lost))
         (unfit if jobs[columns.channel_id].is_unfit else topics).append(columns)
     twice = {jobs[number].info.topic: 0 for number in repeated}
@@ -264,9 +266,10 @@ def _choose_channels(
         for info in infos:
             own = want.alike.get(plain[info.id], {})
             fields = tuple(own.values()) if own else want.fields
+            optional = {own.get(path, path) for path in want.optional}
             name = types[topic] if own else info.type_name
             try:
-                recipe = decoder_for(info, schemas[info.id], fields, where=str(index.path))
+                recipe = decoder_for(info, schemas[info.id], fields, optional, where=str(index.path))
                 spelled = {path: wanted for wanted, path in own.items()}
                 jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields, spelled, name)
             except LogError as error:
@@ -298,12 +301,13 @@ def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, Wanted]:
             merged[want.topic] = Wanted(want.topic)
         else:
             fields = tuple(dict.fromkeys((*before.fields, *want.fields)))
+            needed = {name for one in (before, want) for name in one.fields or () if name not in one.optional}
             alike = {
                 name: {**paths, **want.alike[name]}
                 for name, paths in before.alike.items()
                 if name in want.alike
             }
-            merged[want.topic] = Wanted(want.topic, fields, alike)
+            merged[want.topic] = Wanted(want.topic, fields, alike, frozenset(fields) - needed)
     return merged
 
 
@@ -331,9 +335,7 @@ def list_fields(index: LogIndex) -> dict[str, tuple[str, ...]]:
 
 
 def _no_topic(index: LogIndex, topic: str) -> LogError:
-    known = index.topics()
-    listed = ", ".join(known[:_LISTED]) + (", ..." if len(known) > _LISTED else "")
-    hint = f"It holds: {listed or 'no topics'}"
+    hint = f"It holds: {name_first(index.topics()) or 'no topics'}"
     return LogError("topic_not_found", f"there is no topic {topic}", where=str(index.path), hint=hint)
 
 
@@ -353,9 +355,9 @@ def _list_schemas(index: LogIndex) -> dict[int, bytes]:
     """Schema data of every channel, by its number in the recording."""
     schemas: dict[int, bytes] = {}
     for part in index.parts:
-        for own, channel in part.catalog.channels.items():
-            schema = part.catalog.schemas.get(channel.schema_id)
-            schemas.setdefault(part.numbers[own], schema.data if schema else b"")
+        for own, number in part.numbers.items():
+            schema = part.catalog.schemas.get(part.catalog.channels[own].schema_id)
+            schemas.setdefault(number, schema.data if schema else b"")
     return schemas
 
 
@@ -424,10 +426,17 @@ def _find_repeated(
     return repeated
 
 
-def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list[Loss]]:
+def _finish(job: _Job, repeated: Mapping[int, Ints], *, skip_unfit: bool) -> tuple[TopicColumns, list[Loss]]:
     repeated_rows = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
     log_time, publish_time, rows = job.buffer.finish(repeated_rows)
-    leaves = job.recipe.decoder.columns(rows)
+    leaves: dict[str, Column] = {}
+    try:
+        leaves = job.recipe.decoder.columns(rows)
+    except LogError:
+        # Which fields there are is known of some encodings only from the messages.
+        if not skip_unfit:
+            raise
+        job.is_unfit = True
     header_time = _header_time(leaves, log_time)
     columns_of = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))
     fields = {job.spelled.get(path, path): column for path, column in columns_of.items()}

@@ -15,7 +15,7 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, SlipError
+from pipeline.core import LONGEST_TEXT, Ints, SlipError, shorten
 
 
 class LogError(SlipError):
@@ -52,6 +52,10 @@ class Loss:
     chunks: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        # Losses quote files, whose texts may have any length.
+        object.__setattr__(self, "text", shorten(self.text, LONGEST_TEXT))
 
 
 class ByteSource(Protocol):

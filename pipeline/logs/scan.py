@@ -8,7 +8,7 @@ import numpy as np
 from mcap.records import Channel, Header, Schema
 from numpy.typing import NDArray
 
-from pipeline.core import Ints
+from pipeline.core import Ints, name_first
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.chunks import FIRST_PRIVATE
@@ -260,8 +260,6 @@ class Scanner:
 _STEPS_PER_JUMP: Final = 20
 """Minimum number of increments by one per jump; below it, sequence numbers do not count messages."""
 
-_LISTED: Final = 6
-"""Maximum number of topics listed in a message."""
 
 _WHOLE_FILE: Final = -1
 """Channel number for the sequence over all channels, for writers that number all messages together."""
@@ -403,7 +401,7 @@ def _note_jumps(
 ) -> Loss:
     missing = sum(jump.after - jump.before - 1 for jump in jumps.values())
     topics = [channels[number].topic for number in jumps if number in channels]
-    listed = ", ".join(topics[:_LISTED]) + (", ..." if len(topics) > _LISTED else "")
+    listed = name_first(topics)
     text = (
         f"{missing} messages{f' of {listed}' if listed else ''} are missing between the chunks at "
         f"{position[0]} and {position[1]}: their numbers, which count by one everywhere else, jump there"

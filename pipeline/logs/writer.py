@@ -13,7 +13,7 @@ from typing import BinaryIO, Final, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Ints, group_rows
+from pipeline.core import Flags, Ints, group_rows, name_first
 from pipeline.logs.cdr import RowBuffer, RowWriter
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.decode import Leaf, plan_fields, wanted_leaves
@@ -45,7 +45,7 @@ def normalize_columns(
     leaves = tuple(leaf_paths(structure))
     for path in fields:
         if path not in leaves:
-            hint = f"The type has: {', '.join(leaves)}"
+            hint = f"The type has: {name_first(leaves)}"
             raise LogError("field_not_found", f"there is not a field {path}", where=where, hint=hint)
     if rows == 0:
         return {}

@@ -80,4 +80,4 @@ def _name(gain: ExpectedGain) -> str:
 def _join(gains: Sequence[ExpectedGain]) -> str:
     # Several numbers of one effect are one name.
     names = [name_term(one.effects[0]) if one.kind == "interval" else _name(one) for one in gains]
-    return enumerate_texts(name_first([*dict.fromkeys(names)]))
+    return name_first(dict.fromkeys(names))

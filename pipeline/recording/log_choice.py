@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import return_freed_memory
+from pipeline.core import name_first, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -139,6 +139,8 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> Sequence[TopicColumns]:
         return ()
 
 
+_MOST_UNFIT = 5
+"""Topics without a needed field that are left out of a log: each costs a reading of the others."""
 _STAND_INS: Mapping[str, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "autoware_auto_control_msgs/", "hunter_msgs/")
 
@@ -196,7 +198,7 @@ class Choice:
 
 
 def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:
-    """Choose vehicle and topics of a log.
+    """Choose vehicle and topics of a log; topics whose messages never have a needed field are left out.
 
     Args:
         index: index of the log.
@@ -208,15 +210,40 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
             fitted; several robots.
         LogError: the log cannot be read.
     """
-    where = str(index.path)
-    named = [
+    named = _list_named(configuration)
+    findings: list[Finding] = []
+    while True:
+        try:
+            chosen = _choose_readable(index, configuration, overrides)
+        except LogError as error:
+            # Of some encodings, only the messages tell which fields there are.
+            topic = next((one for one in index.topics() if error.where == f"{index.path}, topic {one}"), None)
+            is_wanted = topic in named or len(findings) == _MOST_UNFIT
+            if error.code != "field_not_found" or topic is None or is_wanted:
+                raise
+            text = f"{topic} is left out: {error.what}"
+            findings.append(Finding("topic_left_out", "warning", text, where=topic))
+            index = replace(index, channels=tuple(one for one in index.channels if one.topic != topic))
+        else:
+            return replace(chosen, findings=(*findings, *chosen.findings))
+
+
+def _list_named(configuration: Configuration) -> list[str]:
+    """Topics that the configuration names."""
+    topics = (
         configuration.pose.topic,
         *list_topics(configuration.command),
         *list_topics(configuration.wheels),
-    ]
-    recognized = recognize_vehicle(
-        index.channels, index.metadata, find_description(index), [topic for topic in named if topic]
     )
+    return [topic for topic in topics if topic]
+
+
+def _choose_readable(
+    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]
+) -> Choice:
+    where = str(index.path)
+    named = _list_named(configuration)
+    recognized = recognize_vehicle(index.channels, index.metadata, find_description(index), named)
     controller = find_controller(index)
     known: dict[str, float] = {}
     if recognized is None:
@@ -313,8 +340,6 @@ def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configu
 MOST_POSES = 40
 """Maximum number of poses whose content is compared: each costs a reading of the drive's topics, too, and the
 platforms of `pipeline/simulate/platforms` record at most ten."""
-_NAMED = 5
-"""Maximum number of topics that a finding names."""
 
 
 def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[list[PoseSource], Finding]:
@@ -412,9 +437,8 @@ def _leave_out_silent(
         return channels, sources, []
     silent = list(dict.fromkeys(one.signals[0].topic for one in texts))
     silent = [topic for topic in silent if topic not in readable]
-    named = ", ".join(silent[:_NAMED]) + (f" and {len(silent) - _NAMED} more" if silent[_NAMED:] else "")
     subject = "the topic was" if len(silent) == 1 else "the topics were"
-    text = f"no message of {named} is a readable command: {subject} left out"
+    text = f"no message of {name_first(silent)} is a readable command: {subject} left out"
     unread = set(silent)
     channels = [channel for channel in channels if channel.topic not in unread]
     sources = choose_sources(channels, configuration, vehicle, where=str(index.path))

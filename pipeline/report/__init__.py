@@ -28,6 +28,7 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.core import (
+    LONGEST_TEXT,
     SlipError,
     format_part,
     format_share,
@@ -374,7 +375,8 @@ def list_failed(store: Store) -> list[dict[str, str]]:
         path = str(mapping_in(note, "log").get("path", ""))
         if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
             continue
-        failed.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
+        texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
+        failed.append({"path": path} | texts)
     return sorted(failed, key=lambda one: one["path"])
 
 

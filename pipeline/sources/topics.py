@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeVar
 
+from pipeline.core import name_first
 from pipeline.logs import TRANSFORM_TYPES, ChannelInfo, find_types, wanted_transforms
 from pipeline.sources.candidates import (
     CONFIGURED,
@@ -457,8 +458,7 @@ class _Chooser:
 
         ranked = sorted(candidates, key=order)
         self.others[role] = tuple(source for _, source in ranked[1:])
-        others = ", ".join(str(source) for source in self.others[role])
-        if others:
+        if others := name_first([str(source) for source in self.others[role]]):
             self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
         return ranked[0][1]
 

@@ -719,7 +719,8 @@ class Extraction:
                 raise StageError("no_sideways", what, where=topic, hint=hint)
             return None
         columns, _, order = self._require(topic, held=held)
-        sideways = reading.numbers(columns, signal.field)[order]
+        # A message without the number asks for none.
+        sideways = np.nan_to_num(reading.numbers(columns, signal.field)[order])
         if not moves and held:
             self.findings += self._check_sideways(sideways, topic)
         return sideways if moves else None

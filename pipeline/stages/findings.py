@@ -7,7 +7,7 @@ from typing import Literal
 import polars as pl
 
 from pipeline.core import SlipError
-from pipeline.logs import Loss
+from pipeline.logs import OVER_BUDGET, Loss
 
 SURE = 5.0
 """Significance threshold [standard errors] for reporting a difference: of a thousand runs without one, normal
@@ -18,11 +18,18 @@ class StageError(SlipError):
     """A log or a table with too little data for a stage."""
 
 
+_BOUNDS = {"too_large", OVER_BUDGET}
+"""Kinds of losses of data that are whole, and more than is read."""
+
+
 def blame_damage(losses: Sequence[Loss]) -> str:
     """Data lost from the log, for messages on missing data; empty without a loss."""
     further = len(losses) - 1
     others = f"; {further} further loss{'es' * (further > 1)}" if further else ""
-    return f" (the log is damaged: {losses[0].text}{others})" if losses else ""
+    if not losses:
+        return ""
+    why = "not all of the log is read" if losses[0].kind in _BOUNDS else "the log is damaged"
+    return f" ({why}: {losses[0].text}{others})"
 
 
 Severity = Literal["info", "warning", "error"]

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, Ints, format_share, rigid
+from pipeline.core import Flags, Floats, Ints, format_share, name_first, rigid
 from pipeline.logs import (
     TRANSFORM_TYPES,
     LogError,
@@ -28,8 +28,6 @@ _MOVES_M: Final = 0.5
 _SPARSE_S: Final = 1.0
 """Time between two corrections [s] above which they are sparse: two windows of velocities. AMCL comes to
 0.3 s, slam_toolbox to 1 to 3 s."""
-_LISTED: Final = 8
-"""Number of bodies that an error lists."""
 
 
 def read_bodies(
@@ -105,7 +103,7 @@ def _no_body(topic: str, why: str, names: Sequence[str]) -> StageError:
         "no_body",
         f"{topic} gives poses of {len(names)} bodies, and which is the vehicle is not known: {why}",
         where=topic,
-        hint=f"Set it in run.toml: [pose] name = one of {', '.join(names[:_LISTED]) or 'its bodies'}.",
+        hint=f"Set it in run.toml: [pose] name = one of {name_first(names) or 'its bodies'}.",
     )
 
 
@@ -433,7 +431,7 @@ def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
     space = drive.strip("/").partition("/")[0] + "/"
     chosen = moving if len(moving) == 1 else [frame for frame in moving if frame.startswith(space)]
     if len(chosen) != 1:
-        moved = f"several frames move ({', '.join(moving[:_LISTED])})" if moving else "no frame moves"
+        moved = f"several frames move ({name_first(moving)})" if moving else "no frame moves"
         raise StageError(
             "no_base_frame",
             f"the transforms have no frame called base_link, base_footprint or base, and {moved}",

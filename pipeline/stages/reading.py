@@ -10,10 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Floats, Ints, rigid
+from pipeline.core import LONGEST_NAME, Flags, Floats, Ints, rigid, shorten
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.logs.columns import complete_stamps, join_times
-from pipeline.logs.index import LONGEST_NAME
 from pipeline.run import STILL_MPS
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -223,6 +222,26 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     return fields
 
 
+def _fields_of(source: DriveSource | PoseSource, types: dict[str, str]) -> list[Signal]:
+    return drive_fields(source, types) if isinstance(source, DriveSource) else pose_fields(source, types)
+
+
+def _list_optional(source: DriveSource | PoseSource, types: dict[str, str]) -> list[Signal]:
+    """Fields that a topic in this role may lack, as JSON messages do: height, sideways speed, frames."""
+    if isinstance(source, DriveSource):
+        sideways = sideways_field(source, types)
+        return [] if sideways is None else [sideways]
+    if source.from_transforms or source.wheels is not None:
+        return []
+    kind = find_type(types[source.topic])
+    pose = source.fields or kind.pose
+    if source.content is PoseContent.POSE and pose is not None:
+        names = (*axis_fields(pose.position, "xyz")[2:], pose.parent, pose.child)
+        return [Signal(source.topic, name) for name in names if name]
+    fixed = () if kind.fix is None else (kind.fix.latitude, kind.fix.longitude)
+    return [one for one in pose_fields(source, types) if one.field not in fixed]
+
+
 def list_wanted(
     sources: Sources, types: dict[str, str], rivals: Iterable[DriveSource | PoseSource] = ()
 ) -> list[Wanted]:
@@ -237,9 +256,7 @@ def list_wanted(
     every = [source for source in roles if source is not None]
     signals: list[Signal] = []
     for source in every:
-        signals += (
-            drive_fields(source, types) if isinstance(source, DriveSource) else pose_fields(source, types)
-        )
+        signals += _fields_of(source, types)
     if sources.imu is not None:
         imu = find_type(types[sources.imu.topic]).imu
         if imu is not None:
@@ -254,13 +271,22 @@ def list_wanted(
         ]
     if sources.interval is not None:
         signals.append(Signal(sources.interval.topic, "data"))
+    used = [source for source in every if source in (sources.command, sources.wheels, sources.pose)]
+    spared = {signal for source in used for signal in _list_optional(source, types)}
+    needed = {signal for source in used for signal in _fields_of(source, types)} - spared
+    beside = {signal for source in every for signal in _fields_of(source, types)} - needed
     by_topic: dict[str, list[str]] = {}
     for signal in signals:
         fields = by_topic.setdefault(signal.topic, [])
         if signal.field not in fields:
             fields.append(signal.field)
     wanted = [
-        Wanted(topic, _recorded_fields(types[topic], fields), find_alike(types[topic], fields))
+        Wanted(
+            topic,
+            _recorded_fields(types[topic], fields),
+            find_alike(types[topic], fields),
+            frozenset((*_stamp_fields(types[topic]), *(one.field for one in beside if one.topic == topic))),
+        )
         for topic, fields in by_topic.items()
     ]
     return wanted + _list_wanted_transforms(every, types)
@@ -499,7 +525,9 @@ def read_pose_topic(columns: TopicColumns, fields: PoseFields | None = None) -> 
         raise _holds_no("pose", columns, "pose")
     position = np.zeros((columns.log_time.size, 3))
     for axis, name in enumerate(axis_fields(pose.position, "xyz")):
-        position[:, axis] = numbers(columns, name)
+        # Poses in the plane have no height.
+        if axis < 2 or name in columns.fields:  # noqa: PLR2004
+            position[:, axis] = numbers(columns, name)
     turns = [numbers(columns, name) for name in _turn_fields(pose)]
     if not turns:
         still = np.zeros(columns.log_time.size)
@@ -590,12 +618,14 @@ def _holds_no(what: str, columns: TopicColumns, role: str) -> StageError:
 
 
 def numbers(columns: TopicColumns, name: str) -> Floats:
-    """A column of plain numbers as float64.
+    """A column of plain numbers as float64; NaN where no message has the field.
 
     Raises:
         StageError: the field is a sequence or a text.
     """
-    column = columns.fields[name]
+    column = columns.fields.get(name)
+    if column is None:
+        return np.full(len(columns), np.nan)
     if not isinstance(column, np.ndarray) or column.ndim != 1:
         what = f"the field {name!r} is not one number a message"
         raise StageError("field_not_a_number", what, where=columns.topic, hint="Name one element: field[0].")
@@ -607,7 +637,7 @@ def first_text(columns: TopicColumns, name: str) -> str:
     column = columns.fields.get(name)
     if isinstance(column, Strings) and len(column) and column.codes[0] >= 0:
         text: str = column.values[int(column.codes[0])]
-        return text[:LONGEST_NAME]
+        return shorten(text, LONGEST_NAME)
     return ""
 
 

@@ -220,39 +220,75 @@ def test_a_full_disk_under_what_is_shown_is_one_line_and_the_watch_goes_on(
     assert "The watch goes on." in told.stderr
 
 
+def begin_watch(log: Path, folder: Path) -> subprocess.Popen[str]:
+    """A watch of a log in a process of its own, which prints a JSON object a line."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "pipeline", "watch", str(log), "--json", "--for", "300", "--results", "out"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path.cwd())},
+    )
+
+
 @pytest.mark.parametrize("by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
-def test_a_signal_ends_a_watch_with_the_diagnosis_so_far(by: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_ends_a_watch_with_what_is_known(by: signal.Signals, tmp_path: Path) -> None:
+    log = make_log(tmp_path / "run.mcap", 6.0)
+    content = log.read_bytes()
+    log.write_bytes(content[: len(content) * 3 // 4])
+    with begin_watch(log, tmp_path) as process:
+        assert process.stdout is not None
+        look = json.loads(process.stdout.readline())
+        process.send_signal(by)
+        said, told = process.communicate(timeout=10)
+    assert f"this is what was known so far, slip diagnose {log} judges the whole log" in told
+    final = json.loads(said.splitlines()[-1])
+    assert (final["kind"], final["stopped"], final["runs"]) == ("final", True, [])
+    assert final["slip_mps"] == look["slip_mps"]
+    assert process.returncode == 0
+
+
+HANG = """
+import sys, threading
+from pipeline.logs import reader
+def hang(*_, **__):
+    print("reading", flush=True)
+    while True:
+        try:
+            threading.Event().wait()
+        except BaseException:
+            pass
+reader._finish = hang
+from pipeline.cli import main
+main(sys.argv[1:])
+"""
+
+
+def test_a_watch_ends_two_seconds_after_a_signal_whatever_it_reads(tmp_path: Path) -> None:
     log = make_log(tmp_path / "run.mcap", 6.0)
     content = log.read_bytes()
     log.write_bytes(content[: len(content) * 3 // 4])
     command = [
         sys.executable,
-        "-m",
-        "pipeline",
+        "-c",
+        HANG,
         "watch",
         str(log),
-        "--json",
         "--for",
         "300",
         "--results",
-        "out",
+        str(tmp_path / "out"),
     ]
-    with subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path.cwd())},
-    ) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        assert json.loads(process.stdout.readline())["kind"] == "look"
-        process.send_signal(by)
-        said, told = process.communicate(timeout=120)
-    assert "stopped watching; this is the diagnosis of the log so far" in told
-    final = json.loads(said.splitlines()[-1])
-    assert (final["kind"], final["stopped"]) == ("final", True)
-    assert process.returncode in {0, 1, 3}
+        assert process.stdout.readline() == "reading\n"
+        process.send_signal(signal.SIGINT)
+        begin = time.monotonic()
+        process.wait(timeout=20)
+    # Other programs may keep this machine busy.
+    assert time.monotonic() - begin < 5.0
+    assert process.returncode == -signal.SIGALRM
 
 
 def test_a_file_that_was_taken_away_while_it_was_watched_is_told(tmp_path: Path) -> None:

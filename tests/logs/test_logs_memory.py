@@ -137,4 +137,4 @@ def test_a_huge_terrain_is_a_name_of_bearable_length(tmp_path: Path) -> None:
         writer.metadata("deployment", {"vehicle": "husky_a200", "terrain": "g" * (8 * MIB)})
         writer.write_columns("/x", FLOAT, START + np.arange(6), {"data": np.arange(6.0)})
     recorded = open_log(path).deployment
-    assert recorded == {"vehicle": "husky_a200", "terrain": "g" * 200 + " (cut, of 8388608 characters)"}
+    assert recorded == {"vehicle": "husky_a200", "terrain": "g" * 200 + "... (cut, of 8,388,608 characters)"}

@@ -152,7 +152,7 @@ def test_a_missing_chain_names_the_known_frames(tmp_path: Path) -> None:
         with pytest.raises(LogError) as caught:
             buffer.lookup_series(parent, child)
         assert caught.value.code == "frame_not_found"
-        assert "lidar, map, odom, ring" in caught.value.hint
+        assert "lidar, map, odom and ring" in caught.value.hint
 
 
 def test_invalid_rotations_are_left_out_and_counted(tmp_path: Path) -> None:
