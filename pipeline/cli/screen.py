@@ -136,7 +136,7 @@ def open_watch(*, quiet: bool) -> SilentWatch:
 Summary = Mapping[str, object]
 
 _LABEL = 10
-_READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
+_READ_FROM_LOG = ("robot_description", "namespace", "message_types", "folder", "fitted")
 _SHOWN = 6
 
 

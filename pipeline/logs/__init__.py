@@ -39,6 +39,7 @@ from pipeline.logs.index import (
     open_log,
     shorten,
     stem_of,
+    take_start,
 )
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics

@@ -1,6 +1,7 @@
 """Choice of a log's vehicle and of the topics of every role, from the log and the configuration.
 
-1. Words of names, message types and a robot description identify the vehicle unless the user names it.
+1. Words of names, message types and a robot description identify the vehicle unless the user names it; of a
+   recording whose end is lost, the other recordings of its folder may.
 2. Types and names rank the topics of every role.
 3. All candidates are read with the data that the run needs. Their content decides which of several is the
    pose, and by its motion `pipeline.recording` decides the rest; the stages reuse the columns.
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import return_freed_memory
+from pipeline.core import format_share, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -34,6 +35,7 @@ from pipeline.logs import (
     read_topics,
     wanted_transforms,
 )
+from pipeline.recording.folder import find_in_folder
 from pipeline.sources import (
     CONFIGURED,
     UNKNOWN_VEHICLE,
@@ -69,6 +71,7 @@ from pipeline.store import JSON
 
 if TYPE_CHECKING:
     from pipeline.recording import Recording
+    from pipeline.recording.geometry import Geometry
     from pipeline.stages import PoseRating
 
 _INDEX = re.compile(r"\[\d+\]$")
@@ -223,6 +226,9 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         recognized, known = _recognize_geometry(index, configuration, controller)
     elif controller is not None:
         recognized = apply_parameters(recognized, controller)
+    beside: tuple[Finding, ...] = ()
+    if recognized is None and not _is_named(index, configuration):
+        recognized, beside = find_in_folder(index)
     problem: ConfigurationError | None = None
     try:
         vehicle, source = _name_vehicle(index, configuration, overrides, recognized)
@@ -235,6 +241,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
         sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
+    findings += beside
     findings += [
         Finding("vehicle_choice", "info", note, where="vehicle")
         for note in (recognized.notes if recognized else ())
@@ -254,6 +261,11 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     if problem is None or not fits:
         return chosen
     return _fit_vehicle(chosen, configuration, problem, known)
+
+
+def _is_named(index: LogIndex, configuration: Configuration) -> bool:
+    """Whether the user or the log names a vehicle, or the user gives one of its lengths or its kind."""
+    return bool(index.deployment.get("vehicle")) or bool(configuration.vehicle.list_values())
 
 
 def _choose_pose(
@@ -572,6 +584,9 @@ def _fit_vehicle(
         configuration: configuration of the user.
         problem: error to raise if wheels have no known radius, and nothing else drives the vehicle.
         recorded: geometry recorded in the log.
+
+    Raises:
+        ConfigurationError: ``radius_contradicted``, commands and poses show wheels of different radius.
     """
     from pipeline.recording.geometry import LENGTHS, describe_vehicle  # noqa: PLC0415 - heavy
 
@@ -588,6 +603,7 @@ def _fit_vehicle(
     fitted = {key: length.value for key, length in lengths.items()}
     errors = {key: float(length.error) for key, length in lengths.items() if key not in known}
     values = {key: value for key, value in {**fitted, **known}.items() if key in LENGTHS}
+    _require_one_radius(recording.geometry, known, problem)
     standing_in = None if sources.pose is None else sources.pose.wheels
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
     is_body = all(drive.form is DriveForm.BODY for drive in drives)
@@ -599,8 +615,8 @@ def _fit_vehicle(
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
         why = (
-            "the vehicle is not known, and its motion does not show the radius of its wheels (--wheel-radius "
-            "gives it)"
+            "the vehicle is not known, and its motion does not show the radius of its wheels (--vehicle, or "
+            "--wheel-radius and --track-width, give it)"
         )
         read = {one.name for one in recording.evidence}
         if read and str(sources.wheels) not in read:
@@ -633,6 +649,22 @@ def _fit_vehicle(
         sources=sources,
         findings=tuple(findings),
     )
+
+
+def _require_one_radius(seen: Geometry, known: Mapping[str, object], problem: ConfigurationError) -> None:
+    """Refuse to fit a vehicle of which commands and poses show wheels of different radius, and nothing else.
+
+    Raises:
+        ConfigurationError: ``radius_contradicted``.
+    """
+    one, other = seen.radius, seen.rolled
+    if "wheel_radius_m" in known or one is None or other is None or not seen.is_contradicted:
+        return
+    what = (
+        f"the vehicle cannot be fitted: by its commands the wheel radius is {one.format()}, by its poses "
+        f"{other.format()}, as if it covered {format_share(other.value / one.value)} of the distance"
+    )
+    raise ConfigurationError("radius_contradicted", what, where=problem.where, hint=problem.hint)
 
 
 def _take_unit_wheels(
