@@ -229,6 +229,8 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     if has_no_pose(read_findings(summary)):
         named += " of the drivetrain, not of the ground,"
     medians = _format_medians(by_input, "median_modulus")
+    if "vehicle_fitted" in summary and "measured" in by_input:
+        medians += f" ({format_vehicle_source('fitted')})"
     if not everything:
         return [_row("slip", f"{named} {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]

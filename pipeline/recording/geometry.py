@@ -164,7 +164,11 @@ def measure_controller(made: Explained) -> tuple[Length | None, Length | None]:
     ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
     errors = list_errors(made)
     radius = take_clear(1.0 / ahead, errors[0]) if ahead > 0.0 else None
-    track = take_clear(bent / ahead, float(np.hypot(errors[0], errors[1]))) if radius is not None and bent > 0.0 else None
+    track = (
+        take_clear(bent / ahead, float(np.hypot(errors[0], errors[1])))
+        if radius is not None and bent > 0.0
+        else None
+    )
     return radius, track
 
 
@@ -252,10 +256,10 @@ def describe_vehicle(
     if kind == "differential" and "track_width_m" not in lengths:
         text += "; there is too little turning for a track, or it is too uneven: give --track-width"
     if fitted:
-        line = "; ".join(f"{key} = {lengths[key]:.4g}" for key in LENGTHS if key in lengths)
+        options = " or --wheel-radius and --track-width" if kind == "differential" else ""
         text += (
             "; it is a guess, and slip from wheel encoders is as uncertain (in brackets: 95 % of ten-second "
-            f'blocks of the drive); to correct it, in run.toml: [vehicle] kind = "{kind}"; {line}'
+            f"blocks of the drive): [vehicle] in run.toml, as slip inspect shows it,{options} corrects it"
         )
     if kind == "ackermann":
         return f"fitted_{1e3 * lengths['wheelbase_m']:.0f}", text

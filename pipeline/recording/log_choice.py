@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import format_share, return_freed_memory
+from pipeline.core import NORMAL_95, format_share, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -168,8 +168,21 @@ class Choice:
     data: LogData | None = None
     recording: Recording | None = None
 
+    def list_fitted(self) -> list[str]:
+        """Lines of the section [vehicle] of run.toml for what was fitted; none where no length was."""
+        vehicle = self.vehicle
+        if self.vehicle_source != "fitted" or not vehicle.errors:
+            return []
+        used = [
+            each.name
+            for each in vehicle.kinematics.geometry
+            if (each.required or each.name in vehicle.errors) and each.name not in vehicle.stand_ins
+        ]
+        lengths = {name: value for name in used if (value := getattr(vehicle, name)) is not None}
+        return [f'kind = "{vehicle.kind}"', *(f"{name} = {value:.4g}" for name, value in lengths.items())]
+
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
-        """The documented keys ``choices``, ``vehicle_source`` and ``signals``.
+        """The documented keys ``choices``, ``vehicle_source`` and ``signals``, of a guess ``vehicle_fitted``.
 
         Args:
             types: message type by topic.
@@ -195,7 +208,26 @@ class Choice:
         signals: list[JSON] = []
         if self.recording is not None:
             signals = [dict(vars(one)) for one in self.recording.evidence]
-        return {"choices": choices, "vehicle_source": self.vehicle_source, "signals": signals}
+        described: dict[str, JSON] = {
+            "choices": choices,
+            "vehicle_source": self.vehicle_source,
+            "signals": signals,
+        }
+        if lines := self.list_fitted():
+            errors = self.vehicle.errors
+            values = {name: float(getattr(self.vehicle, name)) for name in errors}
+            described["vehicle_fitted"] = {
+                "run_toml": "\n".join(["[vehicle]", *lines, ""]),
+                **{
+                    name: {
+                        "value": value,
+                        "low": value - NORMAL_95 * errors[name],
+                        "high": value + NORMAL_95 * errors[name],
+                    }
+                    for name, value in values.items()
+                },
+            }
+        return described
 
 
 def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:

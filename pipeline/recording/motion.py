@@ -157,7 +157,7 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
 
 
 def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) -> float:
-    """Half the width of the 95 % interval in which a gain is over ten seconds of driving.
+    """Half the width of the 95 % interval in which a gain is over another ten seconds of driving.
 
     Every block of ten seconds has a gain of its own by least squares, which counts by the square of its
     column. What differs between them (slip, limits of the drive, errors of poses) is no noise that averages
@@ -182,7 +182,8 @@ def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) ->
     freedom = 1.0 / float(share @ share) - 1.0 if there.any() else 0.0
     if freedom < _LEAST_FREEDOM:
         return math.inf
-    variance = float(share @ (own - gain) ** 2) * (freedom + 1.0) / freedom
+    # Of n blocks the variance has n - 1 degrees of freedom, and that of one more about their mean is 1 + 1 / n.
+    variance = float(share @ (own - gain) ** 2) * (freedom + 2.0) / freedom
     return student_quantile(CONFIDENCE, freedom) * math.sqrt(variance)
 
 
