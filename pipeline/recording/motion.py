@@ -182,7 +182,7 @@ def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) ->
     freedom = 1.0 / float(share @ share) - 1.0 if there.any() else 0.0
     if freedom < _LEAST_FREEDOM:
         return math.inf
-    # Of n blocks the variance has n - 1 degrees of freedom, and that of one more about their mean is 1 + 1 / n.
+    # Of n blocks the variance has n - 1 degrees of freedom; one more is about their mean by 1 + 1 / n of it.
     variance = float(share @ (own - gain) ** 2) * (freedom + 2.0) / freedom
     return student_quantile(CONFIDENCE, freedom) * math.sqrt(variance)
 
