@@ -17,8 +17,6 @@ from pipeline.recording.readings import SIDES, Explained, Reading
 from pipeline.sources import RANGES, DriveForm, find_alike
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
-_ROUGH = 2e-3
-"""Relative standard error from which on an interval is stated."""
 _SAME_TRACK = 0.1
 """Share by which a fitted track may differ from that of a platform without skidding."""
 
@@ -50,11 +48,10 @@ class Length:
         """Ends of the 95 % interval [m]."""
         return self.value - NORMAL_95 * self.error, self.value + NORMAL_95 * self.error
 
-    def format(self) -> str:
-        """The length, and its interval where that is wide."""
+    def format_range(self) -> str:
+        """Ends of the 95 % interval."""
         low, high = self.interval
-        rough = f" ({low:.3g} to {high:.3g} m)" if self.error > _ROUGH * self.value else ""
-        return f"{self.value:.3g} m{rough}"
+        return f"{low:.3g} to {high:.3g} m"
 
 
 def take_clear(value: float, share: float) -> Length | None:
@@ -236,7 +233,11 @@ def describe_vehicle(
             text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
         return "fitted_body", text
     lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
-    parts = _list_parts(seen, kind, lengths)
+    words, shown = _list_shown(seen, kind, lengths)
+    parts = {
+        key: f"a{'n' * words[key].startswith('e')} {words[key]} of {one.value:.3g} m"
+        for key, one in shown.items()
+    }
     fitted = [key for key in parts if key not in given]
     own = " and ".join(text for key, text in parts.items() if key in given)
     if not fitted:
@@ -247,9 +248,9 @@ def describe_vehicle(
     commanded = [parts[key] for key in fitted if by_controller.get(key) is not None]
     moved = [parts[key] for key in fitted if by_controller.get(key) is None]
     if commanded:
-        shown = " and ".join(commanded)
-        verb = "are" if " and " in shown else "is"
-        text += f"; its controller turns commands into wheel speeds by {shown}, which {verb} used"
+        listed = " and ".join(commanded)
+        verb = "are" if " and " in listed else "is"
+        text += f"; its controller turns commands into wheel speeds by {listed}, which {verb} used"
     if moved:
         verb = "fit" if len(moved) > 1 else "fits"
         text += f"; {' and '.join(moved)} {verb} the motion, so that no effect is reported of it"
@@ -257,9 +258,10 @@ def describe_vehicle(
         text += "; there is too little turning for a track, or it is too uneven: give --track-width"
     if fitted:
         options = " or --wheel-radius and --track-width" if kind == "differential" else ""
+        ranges = ", ".join(f"{words[key]} {shown[key].format_range()}" for key in fitted)
         text += (
-            "; it is a guess, and slip from wheel encoders is as uncertain (in brackets: 95 % of ten-second "
-            f"blocks of the drive): [vehicle] in run.toml, as slip inspect shows it,{options} corrects it"
+            f"; it is a guess (95 % of ten-second blocks of the drive: {ranges}), and slip from wheel "
+            f"encoders is as uncertain: [vehicle] in run.toml, as slip inspect shows it,{options} corrects it"
         )
     if kind == "ackermann":
         return f"fitted_{1e3 * lengths['wheelbase_m']:.0f}", text
@@ -268,25 +270,31 @@ def describe_vehicle(
     return f"fitted_{name}", f"{text} ({guess})" if guess else text
 
 
-def _list_parts(seen: Geometry, kind: str, lengths: Mapping[str, float]) -> dict[str, str]:
-    """Lengths [m] in words, by name, those that signals show with their intervals."""
-    words = {
-        "wheel_radius_m": "a wheel radius of",
-        "track_width_m": "a track of",
-        "wheelbase_m": "a wheelbase of",
-    }
-    if kind == "differential" and seen.track is None:
-        words["track_width_m"] = "an effective track (with skidding) of"
+def _list_shown(
+    seen: Geometry, kind: str, lengths: Mapping[str, float]
+) -> tuple[dict[str, str], dict[str, Length]]:
+    """Words for the lengths of a vehicle, and the lengths [m], in order; by name.
+
+    Args:
+        seen: lengths by the signals, with their errors.
+        kind: of the vehicle.
+        lengths: those that are used [m].
+    """
+    words = {"wheel_radius_m": "wheel radius", "track_width_m": "track", "wheelbase_m": "wheelbase"}
     fitted = seen.list_lengths(kind)
+    track = seen.effective if seen.track is None and kind == "differential" else None
+    if track is not None and lengths.get("track_width_m") == track.value:
+        words["track_width_m"] = "effective track (with skidding)"
     shown = {
-        key: fitted[key] if key in fitted and fitted[key].value == value else Length(value, 0.0)
-        for key, value in lengths.items()
+        key: fitted[key] if key in fitted and fitted[key].value == lengths[key] else Length(lengths[key], 0.0)
+        for key in LENGTHS
+        if key in lengths
     }
     if kind == "mecanum":
-        words["track_width_m"] = "a track and a wheelbase of together"
-        track, wheelbase = shown["track_width_m"], shown.pop("wheelbase_m")
-        shown["track_width_m"] = Length(track.value + wheelbase.value, track.error + wheelbase.error)
-    return {key: f"{words[key]} {shown[key].format()}" for key in LENGTHS if key in shown}
+        words["track_width_m"] = "track and a wheelbase together"
+        one, other = shown["track_width_m"], shown.pop("wheelbase_m")
+        shown["track_width_m"] = Length(one.value + other.value, one.error + other.error)
+    return words, shown
 
 
 def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tuple[str, str]:

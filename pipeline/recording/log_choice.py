@@ -693,8 +693,9 @@ def _require_one_radius(seen: Geometry, known: Mapping[str, object], problem: Co
     if "wheel_radius_m" in known or one is None or other is None or not seen.is_contradicted:
         return
     what = (
-        f"the vehicle cannot be fitted: by its commands the wheel radius is {one.format()}, by its poses "
-        f"{other.format()}, as if it covered {format_share(other.value / one.value)} of the distance"
+        f"the vehicle cannot be fitted: by its commands the wheel radius is {one.value:.3g} m "
+        f"({one.format_range()}), by its poses {other.value:.3g} m ({other.format_range()}), as if it "
+        f"covered {format_share(other.value / one.value)} of the distance"
     )
     raise ConfigurationError("radius_contradicted", what, where=problem.where, hint=problem.hint)
 
