@@ -408,7 +408,7 @@ def open_results(results: Path) -> ResultsLocation:
 
 def format_vehicle_source(source: str) -> str:
     """Where the geometry of a vehicle comes from."""
-    words = source.replace("_", " ")
+    words = "other recordings of the folder" if source == "folder" else source.replace("_", " ")
     return "geometry: estimated" if source == "fitted" else f"geometry: from {words}"
 
 

@@ -136,7 +136,7 @@ def open_watch(*, quiet: bool) -> SilentWatch:
 Summary = Mapping[str, object]
 
 _LABEL = 10
-_READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
+_READ_FROM_LOG = ("robot_description", "namespace", "message_types", "folder", "fitted")
 _SHOWN = 6
 
 
@@ -229,6 +229,8 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     if has_no_pose(read_findings(summary)):
         named += " of the drivetrain, not of the ground,"
     medians = _format_medians(by_input, "median_modulus")
+    if "vehicle_fitted" in summary and "measured" in by_input:
+        medians += f" ({format_vehicle_source('fitted')})"
     if not everything:
         return [_row("slip", f"{named} {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]

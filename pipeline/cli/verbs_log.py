@@ -263,6 +263,8 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     if seen.choice is not None and seen.vehicle is not None:
         gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
         lines[-1] += f"{gear}    {format_vehicle_source(seen.choice.vehicle_source)}"
+        fitted = seen.choice.list_fitted()
+        lines += [f"          in run.toml: [vehicle] {'; '.join(fitted)}"] if fitted else []
     lines += _format_roles(seen, everything=everything)
     notes = []
     if seen.sources is not None:

@@ -40,6 +40,7 @@ from pipeline.logs.index import (
     list_files,
     open_log,
     stem_of,
+    take_start,
 )
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics

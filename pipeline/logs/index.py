@@ -600,6 +600,13 @@ class GrowingLog:
         return merge_parts(self.path, parts, (), 0)
 
 
+def take_start(index: LogIndex, chunks: int) -> LogIndex:
+    """Index of the first chunks of each file alone, for what every message of a topic repeats."""
+    starts = (replace(part.catalog, spans=part.catalog.spans[:chunks]) for part in index.parts)
+    parts = tuple(replace(part, catalog=start) for part, start in zip(index.parts, starts, strict=True))
+    return replace(index, parts=parts)
+
+
 def _cut(catalog: Catalog, chosen: set[int] | None) -> Catalog:
     """Catalog without the other chunks with known times; it shares its dictionaries with the original."""
     spans = [one for one in catalog.spans if chosen is None or one.end_ns is None or id(one) in chosen]

@@ -10,7 +10,14 @@ from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.encoders import report_dead, resolve_wheels
 from pipeline.recording.evidence import equal_motion
-from pipeline.recording.geometry import Geometry, Length, explain_wheels, measure_lengths, roll_wheels
+from pipeline.recording.geometry import (
+    Geometry,
+    explain_wheels,
+    list_errors,
+    measure_lengths,
+    roll_wheels,
+    take_clear,
+)
 from pipeline.recording.losses import resolve_losses
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, measure_motion
 from pipeline.recording.outages import leave_out
@@ -354,18 +361,18 @@ def _measure_lengths(case: Case, command: Candidate, wheels: Candidate) -> Geome
         return Geometry()
     fits = {"ahead": explained.ahead, "turned": explained.turned}
     gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
-    errors = {name: 1.0 / max(abs(float(one.t[0])), 1e-9) for name, one in fits.items()}
+    errors = dict(zip(fits, list_errors(explained), strict=True))
     if is_crossed(command):
         # With one side reversed, the mean of the sides is half their difference, and the other way round.
         gains = {"ahead": 0.5 * gains["turned"], "turned": 2.0 * gains["ahead"]}
         errors = {"ahead": errors["turned"], "turned": errors["ahead"]}
     elif not command.sign("ahead"):
         return Geometry()
-    value = case.wheel_factor() / gains["ahead"]
-    radius, width = Length(value, errors["ahead"] * value), None
-    if command.reading.form == "body" and errors["turned"] < 1.0 / CLEAR:
-        value = gains["turned"] / gains["ahead"]
-        width = Length(value, value * float(np.hypot(errors["ahead"], errors["turned"])))
+    radius, width = take_clear(case.wheel_factor() / gains["ahead"], errors["ahead"]), None
+    if command.reading.form == "body" and radius is not None:
+        width = take_clear(
+            gains["turned"] / gains["ahead"], float(np.hypot(errors["ahead"], errors["turned"]))
+        )
     if form == "steering":
         return Geometry(rolled=radius, wheelbase=width)
     return Geometry(radius=radius, track=width)

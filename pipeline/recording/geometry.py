@@ -1,6 +1,7 @@
-"""Lengths of a vehicle by its signals: wheel radius, track and wheelbase, with standard errors.
+"""Lengths of a vehicle by its signals: wheel radius, track and wheelbase, with 95 % intervals.
 
-They come last: no decision on roles, signs and frames needs them, and what is not excited is missing.
+They come last: no decision on roles, signs and frames needs them, and what is not excited is missing. Each is
+a guess: its interval is by how it differs between blocks of the drive, not by the noise of all of it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,16 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import format_share, join_parts
+from pipeline.core import NORMAL_95, format_share, join_parts
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Motion, Steps
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Fit, Motion, Steps
 from pipeline.recording.readings import SIDES, Explained, Reading
 from pipeline.sources import RANGES, DriveForm, find_alike
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
-_ROUGH = 2e-3
-"""Relative standard error from which on it is stated."""
 _SAME_TRACK = 0.1
 """Share by which a fitted track may differ from that of a platform without skidding."""
 
@@ -28,10 +27,44 @@ Over 24 drawn drives the root mean square is 0.4e-3 to 1.8e-3, and fits alone st
 
 @dataclass(frozen=True)
 class Length:
-    """A length with its standard error, both [m]."""
+    """A length [m].
+
+    Attributes:
+        value: by all of the drive.
+        error: standard error, of which the 95 % interval has 1.96 to each side. It is that of the length over
+            ten seconds of driving, see `motion.measure_spread`: the slip of a drive does not average out.
+    """
 
     value: float
     error: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it is far from zero for its error; without two blocks of driving it is not."""
+        return self.error * CLEAR < self.value
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Ends of the 95 % interval [m]."""
+        return self.value - NORMAL_95 * self.error, self.value + NORMAL_95 * self.error
+
+    def format_range(self) -> str:
+        """Ends of the 95 % interval."""
+        low, high = self.interval
+        return f"{low:.3g} to {high:.3g} m"
+
+
+def take_clear(value: float, share: float) -> Length | None:
+    """A length of this value [m] and relative standard error; None if it is not clear."""
+    length = Length(value, value * share)
+    return length if length.is_clear else None
+
+
+def measure_share_error(one: Fit) -> float:
+    """Relative standard error of a gain."""
+    size = abs(float(one.gains[0]))
+    spread = one.spread / (NORMAL_95 * size) if size > 0.0 else np.inf
+    return float(np.hypot(np.hypot(1.0 / max(abs(float(one.t[0])), 1e-9), _METHOD), spread))
 
 
 @dataclass(frozen=True)
@@ -40,8 +73,9 @@ class Geometry:
 
     Attributes:
         radius, track: by which the controller turns commands into wheel speeds.
-        rolled: wheel radius by the motion.
-        effective: track by the motion.
+        rolled: wheel radius by the motion: where wheels slip ahead, less than that of the wheel.
+        effective: track by the motion, for wheels of the radius that is used. Where wheels skid it is more
+            than the distance between them.
         wheelbase: of a car, by the motion.
         is_taken: whether the radius is any, since the speeds of the wheels show none.
     """
@@ -53,14 +87,23 @@ class Geometry:
     wheelbase: Length | None = None
     is_taken: bool = False
 
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the commands show another wheel radius than the motion, beyond both intervals."""
+        one, other = self.radius, self.rolled
+        if one is None or other is None or self.is_taken:
+            return False
+        return abs(one.value - other.value) > NORMAL_95 * (one.error + other.error)
+
     def list_lengths(self, kind: str) -> dict[str, Length]:
         """Plausible lengths of that kind of vehicle by name, those of its controller first."""
         if kind == "ackermann":
             lengths = {"wheelbase_m": self.wheelbase, "wheel_radius_m": self.rolled}
-        elif self.radius is not None:
-            lengths = {"wheel_radius_m": self.radius, "track_width_m": self.track}
         else:
-            lengths = {"wheel_radius_m": self.rolled, "track_width_m": self.effective}
+            lengths = {
+                "wheel_radius_m": self.radius or self.rolled,
+                "track_width_m": self.track or self.effective,
+            }
         wide = lengths.get("track_width_m")
         if kind == "mecanum" and wide is not None:
             # Wheels with rollers turn a body by track and wheelbase together.
@@ -116,43 +159,49 @@ def measure_controller(made: Explained) -> tuple[Length | None, Length | None]:
         Radius and track, each None where it is not excited.
     """
     ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
-    errors = _list_errors(made)
-    radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
+    errors = list_errors(made)
+    radius = take_clear(1.0 / ahead, errors[0]) if ahead > 0.0 else None
     track = (
-        Length(bent / ahead, bent / ahead * float(np.hypot(errors[0], errors[1])))
-        if radius is not None and bent > 0.0 and 1.0 / errors[1] > CLEAR
+        take_clear(bent / ahead, float(np.hypot(errors[0], errors[1])))
+        if radius is not None and bent > 0.0
         else None
     )
     return radius, track
 
 
-def _list_errors(made: Explained) -> list[float]:
+def list_errors(made: Explained) -> list[float]:
     """Relative standard errors of the gains ahead and turning."""
-    return [float(np.hypot(1.0 / max(abs(one.t[0]), 1e-9), _METHOD)) for one in (made.ahead, made.turned)]
+    return [measure_share_error(one) for one in (made.ahead, made.turned)]
 
 
-def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
-    """Wheel radius and effective track by the motion, each None where it is not excited."""
-    ahead, bent = abs(float(wheels.ahead.gains[0])), abs(float(wheels.turned.gains[0]))
-    errors = _list_errors(wheels)
-    radius = Length(ahead, errors[0] * ahead) if wheels.sign("ahead") else None
-    track = (
-        Length(ahead / bent, ahead / bent * float(np.hypot(errors[0], errors[1])))
-        if radius is not None and wheels.sign("turned")
-        else None
-    )
-    return radius, track
+def measure_geometry(
+    wheels: Explained, factor: float = 1.0, radius: Length | None = None
+) -> tuple[Length | None, Length | None]:
+    """Wheel radius and effective track by the motion, each None where it is not excited.
+
+    Args:
+        wheels: motion by speeds of both sides.
+        factor: from the radius of these speeds to that of rad/s.
+        radius: of the wheels, if it is known from elsewhere; the track is one for it.
+    """
+    ahead, bent = (factor * abs(float(one.gains[0])) for one in (wheels.ahead, wheels.turned))
+    errors = list_errors(wheels)
+    rolled = take_clear(ahead, errors[0]) if wheels.sign("ahead") else None
+    used = radius or rolled
+    if used is None or not wheels.sign("turned"):
+        return rolled, None
+    return rolled, take_clear(used.value / bent, float(np.hypot(used.error / used.value, errors[1])))
 
 
 def measure_car(car: Explained, *, is_measured: bool) -> Geometry:
     """Wheelbase of a car that turns by its steering, and the radius of wheels whose turning is measured."""
     ahead, bent = abs(float(car.ahead.gains[0])), abs(float(car.turned.gains[0]))
-    of_speed, of_turn = _list_errors(car)
+    of_speed, of_turn = list_errors(car)
     if not car.sign("ahead"):
-        return Geometry(wheelbase=Length(1.0 / bent, of_turn / bent))
+        return Geometry(wheelbase=take_clear(1.0 / bent, of_turn))
     # A car that is slower than commanded turns by the speed that it has.
-    wheelbase = Length(ahead / bent, ahead / bent * float(np.hypot(of_speed, of_turn)))
-    return Geometry(rolled=Length(ahead, ahead * of_speed) if is_measured else None, wheelbase=wheelbase)
+    wheelbase = take_clear(ahead / bent, float(np.hypot(of_speed, of_turn)))
+    return Geometry(rolled=take_clear(ahead, of_speed) if is_measured else None, wheelbase=wheelbase)
 
 
 def describe_vehicle(
@@ -184,60 +233,76 @@ def describe_vehicle(
             text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
         return "fitted_body", text
     lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
-    errors = {key: length.error for key, length in seen.list_lengths(kind).items()}
-    track = {
-        "differential": "a track of" if seen.radius is not None else "an effective track of",
-        "mecanum": "a track and a wheelbase of together",
-    }
-    words = {
-        "wheel_radius_m": "a wheel radius of",
-        "track_width_m": track.get(kind, "a track of"),
-        "wheelbase_m": "a wheelbase of",
-    }
-    if kind == "mecanum":
-        errors["track_width_m"] = errors.get("track_width_m", 0.0) + errors.pop("wheelbase_m", 0.0)
-        lengths["track_width_m"] += lengths.pop("wheelbase_m")
+    words, shown = _list_shown(seen, kind, lengths)
     parts = {
-        key: f"{words[key]} {lengths[key]:.3g} m"
-        + (
-            f" (±{format_share(errors[key] / lengths[key])})"
-            if key not in given and errors.get(key, 0.0) > _ROUGH * lengths[key]
-            else ""
-        )
-        for key in LENGTHS
-        if key in lengths
+        key: f"a{'n' * words[key].startswith('e')} {words[key]} of {one.value:.3g} m"
+        for key, one in shown.items()
     }
+    fitted = [key for key in parts if key not in given]
     own = " and ".join(text for key, text in parts.items() if key in given)
-    shown = " and ".join(text for key, text in parts.items() if key not in given)
-    if not shown:
+    if not fitted:
         text = f"the vehicle has {own}, as given or recorded"
     else:
         text = "the log does not identify the vehicle" + (f": {own} as given or recorded" if own else "")
-    if shown and kind in {"differential", "mecanum"} and seen.radius is not None:
-        text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
-    elif shown:
-        verb = "fit" if " and " in shown else "fits"
-        text += f"; {shown} {verb} the motion, so that no effect is reported of it"
+    by_controller = {"wheel_radius_m": seen.radius, "track_width_m": seen.track}
+    commanded = [parts[key] for key in fitted if by_controller.get(key) is not None]
+    moved = [parts[key] for key in fitted if by_controller.get(key) is None]
+    if commanded:
+        listed = " and ".join(commanded)
+        verb = "are" if " and " in listed else "is"
+        text += f"; its controller turns commands into wheel speeds by {listed}, which {verb} used"
+    if moved:
+        verb = "fit" if len(moved) > 1 else "fits"
+        text += f"; {' and '.join(moved)} {verb} the motion, so that no effect is reported of it"
     if kind == "differential" and "track_width_m" not in lengths:
-        text += "; there is too little turning for a track: give --track-width"
-    if kind == "ackermann":
-        return (
-            f"fitted_{1e3 * lengths['wheelbase_m']:.0f}",
-            f"{text} (wheelbase_m under [vehicle] gives another)",
+        text += "; there is too little turning for a track, or it is too uneven: give --track-width"
+    if fitted:
+        options = " or --wheel-radius and --track-width" if kind == "differential" else ""
+        ranges = ", ".join(f"{words[key]} {shown[key].format_range()}" for key in fitted)
+        text += (
+            f"; it is a guess (95 % of ten-second blocks of the drive: {ranges}), and slip from wheel "
+            f"encoders is as uncertain: [vehicle] in run.toml, as slip inspect shows it,{options} corrects it"
         )
+    if kind == "ackermann":
+        return f"fitted_{1e3 * lengths['wheelbase_m']:.0f}", text
     is_shown = kind != "mecanum" and not seen.is_taken
     name, guess = _guess_platform(lengths["wheel_radius_m"], lengths.get("track_width_m"), is_shown=is_shown)
-    return f"fitted_{name}", f"{text} ({guess})"
+    return f"fitted_{name}", f"{text} ({guess})" if guess else text
+
+
+def _list_shown(
+    seen: Geometry, kind: str, lengths: Mapping[str, float]
+) -> tuple[dict[str, str], dict[str, Length]]:
+    """Words for the lengths of a vehicle, and the lengths [m], in order; by name.
+
+    Args:
+        seen: lengths by the signals, with their errors.
+        kind: of the vehicle.
+        lengths: those that are used [m].
+    """
+    words = {"wheel_radius_m": "wheel radius", "track_width_m": "track", "wheelbase_m": "wheelbase"}
+    fitted = seen.list_lengths(kind)
+    track = seen.effective if seen.track is None and kind == "differential" else None
+    if track is not None and lengths.get("track_width_m") == track.value:
+        words["track_width_m"] = "effective track (with skidding)"
+    shown = {
+        key: fitted[key] if key in fitted and fitted[key].value == lengths[key] else Length(lengths[key], 0.0)
+        for key in LENGTHS
+        if key in lengths
+    }
+    if kind == "mecanum":
+        words["track_width_m"] = "track and a wheelbase together"
+        one, other = shown["track_width_m"], shown.pop("wheelbase_m")
+        shown["track_width_m"] = Length(one.value + other.value, one.error + other.error)
+    return words, shown
 
 
 def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tuple[str, str]:
-    """Id of the platform with these lengths [m], or digits of them; and what to confirm."""
+    """Id of the platform with these lengths [m], or digits of them; and what to confirm, if anything."""
     name = f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
-    if not is_shown:
-        return name, "[vehicle] gives others"
-    alike = {} if track is None else find_alike(radius, track)
+    alike = find_alike(radius, track) if is_shown and track is not None else {}
     if not alike:
-        return name, "--wheel-radius and --track-width give others"
+        return name, ""
     first, (called, share) = next(iter(alike.items()))
     if abs(share - 1.0) < _SAME_TRACK:
         return first, f"{called} has about these: confirm with --vehicle {first}"
@@ -257,22 +322,22 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
         sides = command if command is not None and command.reading.form == "sides" else None
     else:
         sides = wheels
-    if sides is not None and sides.is_sure and not is_crossed(sides) and sides.reading.explained is not None:
-        rolled, effective = measure_geometry(sides.reading.explained)
-        factor = case.wheel_factor("wheels" if sides is wheels else "command")
-        made = replace(made, rolled=_scale(rolled, factor), effective=effective)
-    if (
+    is_driven = (
         command is not None
         and wheels is not None
         and wheels.reading.form == "sides"
         and command.reading.form == "body"
-        and case.driven is not None
         and case.is_scaled
-    ):
+    )
+    if is_driven and case.driven is not None:
         radius, track = measure_controller(case.driven)
         speed, rate = case.command_factors()
-        radius = made.rolled if case.in_bursts else _scale(radius, speed * case.wheel_factor())
-        made = replace(made, radius=radius, track=_scale(track, speed / rate))
+        radius = None if case.in_bursts else _scale(radius, speed * case.wheel_factor())
+        made = Geometry(radius=radius, track=_scale(track, speed / rate))
+    if sides is not None and sides.is_sure and not is_crossed(sides) and sides.reading.explained is not None:
+        factor = case.wheel_factor("wheels" if sides is wheels else "command")
+        rolled, effective = measure_geometry(sides.reading.explained, factor, made.radius)
+        made = replace(made, rolled=rolled, effective=effective)
     changes = case.changes.get("command" if sides is command else "wheels", {})
     return replace(made, is_taken="scale" in changes or changes.get("unit") in RIMS)
 

@@ -1,6 +1,7 @@
 """Choice of a log's vehicle and of the topics of every role, from the log and the configuration.
 
-1. Words of names, message types and a robot description identify the vehicle unless the user names it.
+1. Words of names, message types and a robot description identify the vehicle unless the user names it; of a
+   recording whose end is lost, the other recordings of its folder may.
 2. Types and names rank the topics of every role.
 3. All candidates are read with the data that the run needs. Their content decides which of several is the
    pose, and by its motion `pipeline.recording` decides the rest; the stages reuse the columns.
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import name_first, return_freed_memory
+from pipeline.core import NORMAL_95, format_share, name_first, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -34,6 +35,7 @@ from pipeline.logs import (
     read_topics,
     wanted_transforms,
 )
+from pipeline.recording.folder import find_in_folder
 from pipeline.sources import (
     CONFIGURED,
     UNKNOWN_VEHICLE,
@@ -69,6 +71,7 @@ from pipeline.store import JSON
 
 if TYPE_CHECKING:
     from pipeline.recording import Recording
+    from pipeline.recording.geometry import Geometry
     from pipeline.stages import PoseRating
 
 _INDEX = re.compile(r"\[\d+\]$")
@@ -167,8 +170,21 @@ class Choice:
     data: LogData | None = None
     recording: Recording | None = None
 
+    def list_fitted(self) -> list[str]:
+        """Lines of the section [vehicle] of run.toml for what was fitted; none where no length was."""
+        vehicle = self.vehicle
+        if self.vehicle_source != "fitted" or not vehicle.errors:
+            return []
+        used = [
+            each.name
+            for each in vehicle.kinematics.geometry
+            if (each.required or each.name in vehicle.errors) and each.name not in vehicle.stand_ins
+        ]
+        lengths = {name: value for name in used if (value := getattr(vehicle, name)) is not None}
+        return [f'kind = "{vehicle.kind}"', *(f"{name} = {value:.4g}" for name, value in lengths.items())]
+
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
-        """The documented keys ``choices``, ``vehicle_source`` and ``signals``.
+        """The documented keys ``choices``, ``vehicle_source`` and ``signals``, of a guess ``vehicle_fitted``.
 
         Args:
             types: message type by topic.
@@ -194,7 +210,26 @@ class Choice:
         signals: list[JSON] = []
         if self.recording is not None:
             signals = [dict(vars(one)) for one in self.recording.evidence]
-        return {"choices": choices, "vehicle_source": self.vehicle_source, "signals": signals}
+        described: dict[str, JSON] = {
+            "choices": choices,
+            "vehicle_source": self.vehicle_source,
+            "signals": signals,
+        }
+        if lines := self.list_fitted():
+            errors = self.vehicle.errors
+            values = {name: float(getattr(self.vehicle, name)) for name in errors}
+            described["vehicle_fitted"] = {
+                "run_toml": "\n".join(["[vehicle]", *lines, ""]),
+                **{
+                    name: {
+                        "value": value,
+                        "low": value - NORMAL_95 * errors[name],
+                        "high": value + NORMAL_95 * errors[name],
+                    }
+                    for name, value in values.items()
+                },
+            }
+        return described
 
 
 def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:
@@ -250,6 +285,9 @@ def _choose_readable(
         recognized, known = _recognize_geometry(index, configuration, controller)
     elif controller is not None:
         recognized = apply_parameters(recognized, controller)
+    beside: tuple[Finding, ...] = ()
+    if recognized is None and not _is_named(index, configuration):
+        recognized, beside = find_in_folder(index)
     problem: ConfigurationError | None = None
     try:
         vehicle, source = _name_vehicle(index, configuration, overrides, recognized)
@@ -262,6 +300,7 @@ def _choose_readable(
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
         sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
+    findings += beside
     findings += [
         Finding("vehicle_choice", "info", note, where="vehicle")
         for note in (recognized.notes if recognized else ())
@@ -281,6 +320,11 @@ def _choose_readable(
     if problem is None or not fits:
         return chosen
     return _fit_vehicle(chosen, configuration, problem, known)
+
+
+def _is_named(index: LogIndex, configuration: Configuration) -> bool:
+    """Whether the user or the log names a vehicle, or the user gives one of its lengths or its kind."""
+    return bool(index.deployment.get("vehicle")) or bool(configuration.vehicle.list_values())
 
 
 def _choose_pose(
@@ -612,6 +656,9 @@ def _fit_vehicle(
     fitted = {key: length.value for key, length in lengths.items()}
     errors = {key: float(length.error) for key, length in lengths.items() if key not in known}
     values = {key: value for key, value in {**fitted, **known}.items() if key in LENGTHS}
+    contradiction = _contradict_radius(recording.geometry, known)
+    if contradiction:
+        values = {key: value for key, value in values.items() if key in known}
     standing_in = None if sources.pose is None else sources.pose.wheels
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
     is_body = all(drive.form is DriveForm.BODY for drive in drives)
@@ -622,13 +669,7 @@ def _fit_vehicle(
             return _take_unit_wheels(chosen, problem, kind, {**values, **given})
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
-        why = (
-            "the vehicle is not known, and its motion does not show the radius of its wheels (--wheel-radius "
-            "gives it)"
-        )
-        read = {one.name for one in recording.evidence}
-        if read and str(sources.wheels) not in read:
-            why = "no speeds of both sides are found in it (left and right under [wheels] name the joints)"
+        why = _explain_left_out(recording, str(sources.wheels), contradiction)
         text = f"not used: {sources.wheels}: {why}"
         findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
         sources, is_body, kind = replace(sources, wheels=None), True, kind.replace("mecanum", "omni")
@@ -656,6 +697,31 @@ def _fit_vehicle(
         vehicle_source="fitted",
         sources=sources,
         findings=tuple(findings),
+    )
+
+
+def _explain_left_out(recording: Recording, wheels: str, contradiction: str) -> str:
+    """Why wheels are not used whose vehicle is not known."""
+    if contradiction:
+        return f"{contradiction} (--wheel-radius and --track-width, or --vehicle, decide)"
+    read = {one.name for one in recording.evidence}
+    if read and wheels not in read:
+        return "no speeds of both sides are found in it (left and right under [wheels] name the joints)"
+    return (
+        "the vehicle is not known, and its motion does not show the radius of its wheels (--vehicle, or "
+        "--wheel-radius and --track-width, give it)"
+    )
+
+
+def _contradict_radius(seen: Geometry, known: Mapping[str, object]) -> str:
+    """By how much commands and poses show wheels of different radius, where nothing else tells it; or ""."""
+    one, other = seen.radius, seen.rolled
+    if "wheel_radius_m" in known or one is None or other is None or not seen.is_contradicted:
+        return ""
+    return (
+        f"by the commands the wheel radius is {one.value:.3g} m ({one.format_range()}), by the poses "
+        f"{other.value:.3g} m ({other.format_range()}), as if the wheels covered "
+        f"{format_share(other.value / one.value)} of the distance"
     )
 
 

@@ -12,7 +12,19 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.core import Complex, Flags, Floats, Ints, find_scale, list_likelihoods, recur, rigid, weigh
+from pipeline.core import (
+    CONFIDENCE,
+    Complex,
+    Flags,
+    Floats,
+    Ints,
+    find_scale,
+    list_likelihoods,
+    recur,
+    rigid,
+    student_quantile,
+    weigh,
+)
 
 BLOCK_S = 5.0
 """Length of a block [s], longer than any correlation of the noise that is modelled."""
@@ -22,12 +34,18 @@ LEAST_NATS = 0.02
 """Least gain in log-likelihood per step of a decision: below it a difference is of no importance."""
 FEWEST_STEPS = 30
 """Least number of steps for a likelihood."""
+DRIVEN_S = 10.0
+"""Driving [s] in one of the blocks that the first gain of a fit is compared between: time enough for starts,
+stops and turns, so that what differs is not the manoeuvre alone."""
 _ROUNDING_S = 1e-6
 _NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta in (0.0, 0.3, 0.6, 0.85)
                          if phi != theta))  # fmt: skip
 """Grid of the noise's (phi, theta)."""
 
 
+_LEAST_FREEDOM = 0.5
+"""Least number of degrees of freedom of a spread: with less, one block has more than five times the weight of
+the other."""
 _MOST_ROWS = 3000
 """Number of steps above which the noise is fitted to some of the blocks."""
 
@@ -69,12 +87,15 @@ class Fit:
         t: their ratios to standard errors that are robust to correlation within blocks, shape (k,).
         blocks: log-likelihood of every block, shape (m,).
         turned: the same with the first coefficient of the other sign.
+        spread: half the width of the 95 % interval in which the first coefficient is over ten seconds of
+            driving, by how far it is from those of such blocks, see `measure_spread`.
     """
 
     gains: Floats
     t: Floats
     blocks: Floats
     turned: Floats
+    spread: float = math.inf
 
 
 def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
@@ -130,7 +151,40 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
     error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
     other = list_likelihoods(rest + 2.0 * gains[0] * design[:, 0])
-    return Fit(gains, gains / error, blocks, np.bincount(steps.block, other).astype(np.float64))
+    turned: Floats = np.bincount(steps.block, other).astype(np.float64)
+    spread = measure_spread(values - columns[:, 1:] @ gains[1:], columns[:, 0], float(gains[0]), steps)
+    return Fit(gains, gains / error, blocks, turned, spread)
+
+
+def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) -> float:
+    """Half the width of the 95 % interval in which a gain is over another ten seconds of driving.
+
+    Every block of ten seconds has a gain of its own by least squares, which counts by the square of its
+    column. What differs between them (slip, limits of the drive, errors of poses) is no noise that averages
+    out over a drive: another drive differs as they do.
+
+    Args:
+        values: increments, shape (n,).
+        column: explaining increments, shape (n,).
+        gain: of all increments; the blocks are compared with it, not with their mean.
+        steps: the time steps.
+
+    Returns:
+        The half width; infinite where less than two blocks count.
+    """
+    driven = np.cumsum(steps.end - steps.start)
+    count = max(2, int(driven[-1] // DRIVEN_S))
+    block = np.minimum((count * driven / driven[-1]).astype(np.int64), count - 1)
+    power, product = (np.bincount(block, column * one, count) for one in (column, values))
+    there = power > 0.0
+    own = product[there] / power[there]
+    share = power[there] / power.sum()
+    freedom = 1.0 / float(share @ share) - 1.0 if there.any() else 0.0
+    if freedom < _LEAST_FREEDOM:
+        return math.inf
+    # Of n blocks the variance has n - 1 degrees of freedom; one more is about their mean by 1 + 1 / n of it.
+    variance = float(share @ (own - gain) ** 2) * (freedom + 2.0) / freedom
+    return student_quantile(CONFIDENCE, freedom) * math.sqrt(variance)
 
 
 def measure_share(values: Floats, model: Floats) -> float:

@@ -203,8 +203,11 @@ VehicleSource = Literal[
     "message_types",
     "parameters",
     "transforms",
+    "folder",
     "fitted",
 ]
+"""What says which vehicle it is: ``folder`` are other recordings of the same folder, and of a vehicle that is
+``fitted`` only its signals show the geometry."""
 _DIFFERS = 0.1
 _SAME_WHEEL = 0.02
 """Share by which a wheel radius may differ from that of its platform: tyres give way as much under a load."""
