@@ -365,7 +365,6 @@ def list_statements(seen: Seen) -> list[tuple[str, str]]:
     duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
     rows = [
         ("watching", f"{seen['log']}    {state}"),
-        ("server", str(seen.get("source") or "")),
         ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size}"),
         ("slip", _format_slip_now(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
         ("error", _format_model_error(seen)),

@@ -420,10 +420,7 @@ _LABELLED = re.compile(r"(?:[a-z]+(?: [a-z]+)?)? +")
 def watch(  # noqa: D417 - the shared choices document themselves
     log: Annotated[
         Path,
-        Parameter(
-            help="MCAP file that is being recorded, the folder it is written to, or the address of a server: "
-            "ws://127.0.0.1:8765"
-        ),
+        Parameter(help="MCAP file that is being recorded, or the folder it is written to"),
     ],
     /,
     *,
@@ -434,56 +431,37 @@ def watch(  # noqa: D417 - the shared choices document themselves
     page: Annotated[
         Path | None, Parameter(help="also write a page to this file, which reloads itself in a browser")
     ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Parameter(
-            negative=(), help="of a server: record this topic, NAME or NAME=TYPE; can be given several times"
-        ),
-    ] = None,
-    record: Annotated[
-        Path | None, Parameter(help="of a server: folder of the recording; by default named by port and time")
-    ] = None,
     json: bool = False,
 ) -> int:
     """Diagnose a recording while it is written.
 
-    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log. An address is that of a
-    Foxglove WebSocket or rosbridge server on this machine, whose messages are recorded.
+    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log.
 
     Args:
         json: print one JSON object a line instead of the screen.
     """
-    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-    from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
-    from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
+    from pipeline.live.watch import Watch, choose_recording  # noqa: PLC0415 - heavy
 
-    options = build_options(choices)
-    address = parse_address(str(log))
-    with contextlib.ExitStack() as receiving:
-        live = None
-        if address is not None:
-            live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
-        path = choose_recording(log) if live is None else live.path
-        arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
-        watched = Watch(path, options, arguments, quiet_for, live)
-        is_screen = sys.stdout.isatty() and not json
-        stopped, reported = False, ""
-        try:
-            with _stopping_on_termination():
-                for seen in watched.follow():
-                    try:
-                        _show(seen, page, json=json, is_screen=is_screen)
-                        write_statement(choices.results, path, list_statements(seen))
-                    except BrokenPipeError:
-                        raise
-                    except (SlipError, OSError) as error:
-                        # A disk may be full or a folder gone: the recording is worth more than what is shown.
-                        if str(error) != reported:
-                            reported = str(error)
-                            print_note(f"slip: {reported} The watch goes on.")
-        except KeyboardInterrupt:
-            stopped = True
-            print_note("slip: stopped watching; this is the diagnosis of the log so far")
+    path = choose_recording(log)
+    arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
+    watched = Watch(path, build_options(choices), arguments, quiet_for)
+    is_screen = sys.stdout.isatty() and not json
+    stopped, reported = False, ""
+    try:
+        with _stopping_on_termination():
+            for seen in watched.follow():
+                try:
+                    _show(seen, page, json=json, is_screen=is_screen)
+                except BrokenPipeError:
+                    raise
+                except (SlipError, OSError) as error:
+                    # A disk may be full or a folder gone: the watch is worth more than what is shown.
+                    if str(error) != reported:
+                        reported = str(error)
+                        print_note(f"slip: {reported} The watch goes on.")
+    except KeyboardInterrupt:
+        stopped = True
+        print_note("slip: stopped watching; this is the diagnosis of the log so far")
     if watched.live.problem and not watched.live.slip_mps:
         print_note(f"slip: no slip was seen: {watched.live.problem}")
     return _conclude(watched, choices, page, json=json, stopped=stopped)
@@ -539,10 +517,8 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
 
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
     """Diagnose the whole log, as `slip diagnose` does."""
-    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
     from pipeline.cli.verbs_effects import Diagnosed, diagnose_logs  # noqa: PLC0415 - heavy
     from pipeline.live.running_log import list_alarms  # noqa: PLC0415 - heavy
-    from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
 
     diagnosed, logs = Diagnosed(), [str(watched.path)]
     with limited_memory(None, lambda: logs[0], lambda _: None):
@@ -550,16 +526,13 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     alarms = [alarm for run in diagnosed.runs for alarm in list_alarms(run.effects)]
     lines = diagnosed.list_lines(logs, spell_choices(choices))
     lines += [f"alarm     {alarm['text']}" for alarm in alarms]
-    rows = [("", line) for line in lines]
     if json:
         answer = {"kind": "final", "stopped": stopped, "alarms": alarms, **diagnosed.to_json()}
         sys.stdout.write(json_format.dumps(answer) + "\n")
-        rows = list_statements(watched.to_json())
     else:
         print_lines(lines)
     if page is not None:
         _write_page(page, lines, is_live=False)
-    write_statement(choices.results, watched.path, rows, ended=True)
     if not stopped:
         watched.forget()
     return diagnosed.end(quiet=False)

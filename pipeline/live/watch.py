@@ -29,53 +29,6 @@ from pipeline.run import read_drive
 from pipeline.stages import Finding, Given, align_tables, extract_tables, list_wanted, slip_stage, velocity
 from pipeline.store import JSON, Store, check_table
 
-_FOLDER = "live"
-_SHOWN = 5
-"""Largest number of watched recordings on a page, the newest first."""
-_MOST_ROWS, _LONGEST = 200, 1000
-"""Largest number of shown rows of a statement, and of characters of a text: the results are untrusted."""
-
-
-class LiveStatement(msgspec.Struct, kw_only=True):
-    """Last output of a watch: the rows that its terminal shows, stored with the results.
-
-    `slip watch` writes it with every update, `slip serve` shows it.
-
-    Attributes:
-        log: the recording.
-        rows: label and text of each row; a row without a label continues the previous one.
-        time: time of the output [s since 1970].
-        ended: whether the watch has ended; the rows are then the diagnosis of the whole recording.
-    """
-
-    log: str
-    rows: list[tuple[str, str]]
-    time: float
-    ended: bool = False
-
-
-def write_statement(
-    results: Path, log: Path, rows: Sequence[tuple[str, str]], *, ended: bool = False
-) -> None:
-    """Store the current output of a watch, replacing the previous one."""
-    said = LiveStatement(log=str(log), rows=list(rows), time=time.time(), ended=ended)
-    content: dict[str, JSON] = msgspec.to_builtins(said)
-    Store(results).notes(_FOLDER).write(str(log.resolve()), content)
-
-
-def read_statements(store: Store) -> list[LiveStatement]:
-    """Last outputs of the watches of these results, the newest first; invalid files are skipped."""
-    statements = []
-    for note in store.notes(_FOLDER).read_all():
-        try:
-            said = msgspec.convert(note, LiveStatement)
-        except msgspec.ValidationError:
-            continue
-        rows = [(label[:_LONGEST], text[:_LONGEST]) for label, text in said.rows[:_MOST_ROWS]]
-        statements.append(msgspec.structs.replace(said, log=said.log[:_LONGEST], rows=rows))
-    return sorted(statements, key=lambda said: -said.time)[:_SHOWN]
-
-
 Content = Mapping[str, object]
 
 TAIL_S = 120.0
@@ -192,21 +145,13 @@ class Watch:
         options: options of the user, including the results folder.
         arguments: the user's options for the command line of a diagnosis.
         quiet_s: time without growth of the log after which the watch ends [s].
-        log: the recording at that path; None to follow the files there.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        options: Options,
-        arguments: Sequence[str],
-        quiet_s: float,
-        log: GrowingLog | None = None,
-    ) -> None:
+    def __init__(self, path: Path, options: Options, arguments: Sequence[str], quiet_s: float) -> None:
         self.path, self._options, self._arguments, self._quiet_s = path, options, arguments, quiet_s
         self.live = Live()
         self.knowledge: dict[str, object] = {}
-        self._log = log or GrowingLog(path)
+        self._log = GrowingLog(path)
         self._light, self._heavy = _Clock(LIGHT_SHARE), _Clock(HEAVY_SHARE)
         self._setup: tuple[int, LogSetup] | None = None
         self._model: Path | None = None
@@ -224,7 +169,7 @@ class Watch:
         Raises:
             LogError: the log is missing, cannot be read, or has never grown.
         """
-        grown, noted = time.monotonic(), self._log.note
+        grown = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="slip-watch-") as scratch:
             try:
                 while True:
@@ -241,8 +186,7 @@ class Watch:
                     except Exception as error:  # noqa: BLE001 - neither does one of a diagnosis
                         judged, self.knowledge["problem"] = True, _describe_defect(error)
                         self._heavy.note(now, 1.0)
-                    if seen or judged or self._log.note != noted:
-                        noted = self._log.note
+                    if seen or judged:
                         yield self.to_json()
                     if is_over and not self._log.is_closed:
                         self._refuse_still()
@@ -408,11 +352,10 @@ class Watch:
             "log": str(self.path),
             "bytes": self._log.size,
             "closed": self._log.is_closed,
-            "source": self._log.note,
             **vars(self.live),
             "knowledge": dict(self.knowledge),
             "diagnosing": self._diagnosing is not None,
-            "cpu_share": round((measure_cpu() - self._cpu + self._log.cpu_s) / wall, 3),
+            "cpu_share": round((measure_cpu() - self._cpu) / wall, 3),
         }
 
     def _end(self) -> None:

@@ -513,16 +513,6 @@ class GrowingLog:
         self._files: dict[Path, _GrowingFile] = {}
         self._end_s = 0.0
 
-    @property
-    def note(self) -> str:
-        """Status of the recording's source; empty for a file."""
-        return ""
-
-    @property
-    def cpu_s(self) -> float:
-        """CPU time of the process that writes it for the watch [s]; 0 for a file written by others."""
-        return 0.0
-
     def update(self) -> bool:
         """Scan the data added since the last call; returns whether there is any.
 

@@ -54,7 +54,6 @@ WORDS: list[tuple[str, str]] = [
     ("diagnose field/wide --model missing.toml", "missing.toml"),
     ("diagnose no/such --apply mine.toml", "there is no run 'no/such'. There are: field/wide."),
     ("diagnose field/wide --model jackal.toml", "--vehicle-of run"),
-    ("watch ws://192.0.2.1:8765", "192.0.2.1"),
     ("export missing --to csv", "missing"),
     ("serve missing --memory much", "'much' is not a size"),
     ("effects nothing", "no effect is called 'nothing'"),
