@@ -9,7 +9,6 @@ import importlib
 import itertools
 import json
 import os
-import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -31,7 +30,6 @@ from pipeline.cli.conventions import (
     USAGE,
     print_error,
     print_lines,
-    print_note,
     summarize_error,
 )
 from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
@@ -59,15 +57,6 @@ _GROUPS = {
 
 _YOUNG = 20_000
 """Threshold of the garbage collector [new objects]: nearly all are freed without it, and it takes time."""
-_MOVED = {
-    **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
-    **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
-    "schedule": "batch",
-}
-"""Former top-level commands, and the command that each belongs to now."""
-
-_FORMER_OUT = {"simulate": "--file", "model export": "--file", "plan": "--folder"}
-"""Present name of the former option `--out`, by command; for all others it is `--results`."""
 
 
 def build_app(verb: str = "") -> App:
@@ -140,15 +129,6 @@ def _format_usage(error: CycloptsError) -> object:
     return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
 
 
-def _rename_out(words: Sequence[str]) -> list[str]:
-    """Replace the former option `--out` by its present name, except after `--`."""
-    options = list(words)[: words.index("--")] if "--" in words else list(words)
-    said = " ".join(options)
-    name = next((now for verb, now in _FORMER_OUT.items() if said.startswith(verb)), "--results")
-    renamed = [re.sub(r"^--out(?==|$)", name, word) for word in options]
-    return [*renamed, *words[len(options) :]]
-
-
 def _refuse(words: Sequence[str], error: SlipError) -> None:
     """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
     if "--json" in itertools.takewhile(lambda word: word != "--", words):
@@ -167,16 +147,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     keep_current_folder_out()
     silence_warnings()
     gc.set_threshold(_YOUNG)
-    words = _rename_out(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         verb = next(iter(words), "")
         if verb == "help":
             words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
-        if verb in _MOVED:
-            what = f"slip {verb} is now: slip {_MOVED[verb]} {verb}"
-            print_note(f"slip: {what}")
-            _refuse(words, SlipError("usage", what, hint=f"See slip {_MOVED[verb]} --help"))
-            sys.exit(USAGE)
         code = build_app(verb)(words, exit_on_error=False)
     except CycloptsError as error:
         chain = " ".join(error.command_chain or ())
