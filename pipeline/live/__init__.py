@@ -84,7 +84,7 @@ def follow(path: Path, arguments: Sequence[str], *, every_s: float, quiet_s: flo
         LogError: ``log_gone``, a file was removed.
     """
     before: Sequence[str] = ()
-    size, grown, due, is_seen = -1, 0.0, 0.0, True
+    state, grown, due, is_seen = (-1, False), 0.0, 0.0, True
     while True:
         begin, hint = time.monotonic(), "Leave the files of a recording where they are until it ends"
         with naming_os_errors(LogError, "log_gone", "the recording cannot be read", where=path, hint=hint):
@@ -92,8 +92,8 @@ def follow(path: Path, arguments: Sequence[str], *, every_s: float, quiet_s: flo
             # Before the look, which then holds all of a closed recording.
             is_closed = not path.is_dir() or (path / LISTING).exists()
             is_closed = is_closed and all(map(is_finished, files))
-            last, size = size, sum(file.stat().st_size for file in files)
-        if size != last:
+            last, state = state, (sum(file.stat().st_size for file in files), is_closed)
+        if state != last:
             grown, is_seen = begin, False
         is_over = is_closed or begin - grown > quiet_s
         if not is_seen and (is_over or begin >= due):

@@ -178,6 +178,17 @@ def test_it_looks_again_when_the_file_has_grown_until_it_is_closed(
     assert list(looks) == []
 
 
+def test_a_folder_is_closed_by_its_listing(answers: list[dict[str, Any]], tmp_path: Path) -> None:
+    log = make_log(tmp_path / "bag" / "bag_0.mcap", 3.0)
+    answers += [find(), find()]
+    looks = follow(log.parent, (), every_s=0.0, quiet_s=60.0)
+    assert list_effects(next(looks)) == []
+    (log.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n", encoding="utf-8")
+    last = next(looks)
+    assert (last["closed"], list_effects(last)) == (True, ["effective_track"])
+    assert list(looks) == []
+
+
 def test_an_effect_is_reported_after_two_looks(answers: list[dict[str, Any]], tmp_path: Path) -> None:
     log = make_log(tmp_path / "run.mcap", 3.0)
     content = cut(log, 0.5)
