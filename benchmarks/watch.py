@@ -20,8 +20,7 @@ from measuring import add_row, read_rows
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.live.running_log import list_passing, list_stated
-from pipeline.live.watch import measure_cpu
+from pipeline.live import list_known, list_passing
 from pipeline.results import RunDiagnosis, read_result, to_json
 
 Content = Mapping[str, object]
@@ -64,7 +63,7 @@ def replay(category: str, seed: int) -> dict[str, object]:
 
 def look(log: Path, out: Path) -> dict[str, object]:
     """One look: the effects that are named, and what it took."""
-    begin, spent = time.perf_counter(), measure_cpu()
+    begin, spent = time.perf_counter(), time.process_time()
     try:
         outcome = analyze_log(log, Options(out=out, report=False, diagnosis=True))
         diagnosis, problem = read_result(outcome.summary["diagnosis"], RunDiagnosis), None
@@ -73,7 +72,7 @@ def look(log: Path, out: Path) -> dict[str, object]:
     return {
         "effects": to_json(RunDiagnosis(effects=diagnosis.effects))["effects"],
         "undecided": [list(one.candidates) for one in diagnosis.undecided],
-        "cpu_s": round(measure_cpu() - spent, 2),
+        "cpu_s": round(time.process_time() - spent, 2),
         "wall_s": round(time.perf_counter() - begin, 2),
         "error": problem,
     }
@@ -88,17 +87,22 @@ def judge(record: Content) -> Iterator[dict[str, object]]:
     before: list[str] = []
     for here in running:
         seen = read_result({"effects": here["effects"]}, RunDiagnosis)
-        for stated in list_stated(seen, before):
-            found = cast("Mapping[str, Content]", final.get(stated.id, {}).get("parameters", {}))
+        stated: dict[str, list[Content]] = {}
+        for one in list_known(seen, before):
+            stated.setdefault(one["effect"], []).append(one)
+        for effect, numbers in stated.items():
+            found = cast("Mapping[str, Content]", final.get(effect, {}).get("parameters", {}))
             ends = [
-                (number["low"], cast("Content", found[name])["value"], number["high"])
-                for name, number in stated.numbers.items()
-                if name in found and number["low"] is not None and found[name]["value"] is not None
+                (one["low"], found[str(one["parameter"])]["value"], one["high"])
+                for one in numbers
+                if one["parameter"] in found
+                and one["low"] is not None
+                and found[str(one["parameter"])]["value"] is not None
             ]
             yield {
                 "share": here["share"],
-                "effect": stated.id,
-                "kept": stated.id in final,
+                "effect": effect,
+                "kept": effect in final,
                 "held": [
                     low <= value <= high
                     for low, value, high in cast("list[tuple[float, float, float]]", ends)

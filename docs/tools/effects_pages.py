@@ -112,12 +112,6 @@ def _list_limits(kind: type[Effect]) -> list[str]:
                 f"{escape(p.plausible.source)}. Outside of it the effect is reported only "
                 "as tentative, where nothing else halves the error."
             )
-        if p.learned_within:
-            low, high = p.learned_within.low, p.learned_within.high
-            lines.append(
-                f"- `{p.name}` outside of {low:g} to {high:g} is an alarm of `slip watch`: "
-                f"{escape(p.learned_within.source)}."
-            )
         if p.least:
             lines.append(
                 f"- `{p.name}` within {p.least.size:g} of neutral is below the detection threshold: "

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 FOLDER = ROOT / "docs" / "pages" / "pictures"
 LOG = "data_samples/warthog_ice.mcap"
 SLIP = Path(sys.executable).parent / "slip"
-GROWING = "data_samples/husky_tile.mcap"
 WIDTH, HEIGHT = 1280, 800
 DRAWN = "document.querySelector('.plot') && !document.querySelector('.plot:not(.drawn)')"
 CARDS = "document.querySelectorAll('.card').length"
@@ -44,7 +43,7 @@ FRAME_MS = 2000
 
 
 def draw_pictures(folder: Path) -> list[Path]:
-    """Make the pictures in a folder: report, workbench, a watched log, the error as effects are added.
+    """Make the pictures in a folder: report, workbench, the error as effects are added.
 
     Raises:
         RuntimeError: there is no Chromium.
@@ -75,34 +74,11 @@ def draw_pictures(folder: Path) -> list[Path]:
                 time.sleep(1.0)
                 frames.append(Path(work) / f"frame_{count}.png")
                 chrome.picture(frames[-1])
-            _draw_live(chrome, address, results, Path(work), folder / "live.png")
         shutil.copy(frames[2], folder / "workbench.png")
         (folder / "falling.png").write_bytes(join_frames([frame.read_bytes() for frame in frames], FRAME_MS))
         _draw_terrain(chrome, Path(work), folder / "terrain.png")
-    names = ("report.png", "workbench.png", "falling.png", "live.png", "terrain.png")
+    names = ("report.png", "workbench.png", "falling.png", "terrain.png")
     return [folder / name for name in names]
-
-
-def _draw_live(chrome: Chrome, address: str, results: Path, work: Path, picture: Path) -> None:
-    """The page of a log that is being written: two parts of a sample log, each diagnosed."""
-    content, log = (ROOT / GROWING).read_bytes(), work / "yard.mcap"
-    log.write_bytes(content[: int(0.6 * len(content))])
-    command = [SLIP, "watch", log.name, "--results", results, "--for", "600", "--json"]
-    with subprocess.Popen(command, cwd=work, stdout=subprocess.PIPE, text=True) as watch:  # noqa: S603
-        try:
-            for line in watch.stdout or ():
-                known = json.loads(line)["knowledge"]
-                if known.get("stated"):
-                    break
-                if known:
-                    log.write_bytes(content[: int(0.95 * len(content))])
-            chrome.open(address)
-            chrome.run("location.href = '/live'")
-            chrome.wait("document.querySelector('.watched [data-label=known]')")
-            chrome.size(WIDTH, HEIGHT // 2)
-            chrome.picture(picture)
-        finally:
-            watch.kill()
 
 
 def _draw_terrain(chrome: Chrome, work: Path, picture: Path) -> None:

@@ -11,8 +11,6 @@ from __future__ import annotations
 import argparse
 import base64
 import os
-import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -200,30 +198,6 @@ def write_check(results: Path, work: Path) -> Screen:
     return Screen("check", page.as_uri())
 
 
-def watch_half(work: Path) -> list[Screen]:
-    """The page of a recording that still grows, and that of its end."""
-    whole = (ROOT / "data_samples" / f"{SAMPLES[1]}.mcap").read_bytes()
-    log, page, live = work / "growing.mcap", work / "watched.html", work / "watching.html"
-    log.write_bytes(whole[: len(whole) // 2])
-    watch = subprocess.Popen(  # noqa: S603
-        [SLIP, "watch", log, "--for", "600", "--page", page, "--results", work / "watched"],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    with watch:
-        try:
-            while "<dt>slip</dt>" not in (page.read_text(encoding="utf-8") if page.is_file() else ""):
-                if watch.poll() is not None:
-                    raise RuntimeError(f"slip watch ended with {watch.returncode}")
-                time.sleep(0.2)
-            shutil.copy(page, live)
-        finally:
-            os.killpg(watch.pid, signal.SIGINT)
-    return [Screen("watch_live", live.as_uri()), Screen("watch_final", page.as_uri())]
-
-
 def build_handbook(work: Path) -> list[Screen]:
     """Pages of the handbook."""
     site = work / "handbook"
@@ -259,7 +233,6 @@ class Studio:
             "page": lambda: write_pages(self._fleet),
             "plan": lambda: [write_plan(work)],
             "check": lambda: [write_check(self._results, work)],
-            "watch": lambda: watch_half(work),
             "handbook": lambda: build_handbook(work),
         }
 

@@ -157,7 +157,16 @@ class Work:
         return self.generation.write_table(table, self._identify(table, frame), facts)
 
     def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
-        return identify(table, frame, self.run, self.setup)
+        """A table with the columns of its contract that say which run it is of."""
+        setup = self.setup
+        who = {
+            "run": self.run,
+            "dataset": setup.dataset,
+            "vehicle": setup.vehicle.id,
+            "terrain": setup.terrain,
+        }
+        labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
+        return labelled.select(contract_of(table).schema.column_names())
 
     def _read(self, table: str) -> pl.DataFrame:
         """A table of an earlier stage; an empty frame if the log has no data for it."""
@@ -328,13 +337,6 @@ class Work:
         )
         self.write("aggregates", made)
         return StageOutcome(())
-
-
-def identify(table: str, frame: pl.DataFrame, run: str, setup: LogSetup) -> pl.DataFrame:
-    """A table with the columns of its contract that say which run it is of."""
-    who = {"run": run, "dataset": setup.dataset, "vehicle": setup.vehicle.id, "terrain": setup.terrain}
-    labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
-    return labelled.select(contract_of(table).schema.column_names())
 
 
 def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:

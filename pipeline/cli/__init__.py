@@ -7,7 +7,6 @@ the program, its verbs by task, and what errors become.
 import gc
 import importlib
 import os
-import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -31,7 +30,6 @@ from pipeline.cli.conventions import (
     limited_memory,
     print_error,
     print_lines,
-    print_note,
     refuse_json,
 )
 from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
@@ -59,15 +57,6 @@ _GROUPS = {
 
 _YOUNG = 20_000
 """Threshold of the garbage collector [new objects]: nearly all are freed without it, and it takes time."""
-_MOVED = {
-    **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
-    **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
-    "schedule": "batch",
-}
-"""Former top-level commands, and the command that each belongs to now."""
-
-_FORMER_OUT = {"simulate": "--file", "model export": "--file", "plan": "--folder"}
-"""Present name of the former option `--out`, by command; for all others it is `--results`."""
 
 
 def build_app(verb: str = "") -> App:
@@ -140,15 +129,6 @@ def _format_usage(error: CycloptsError) -> object:
     return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
 
 
-def _rename_out(words: Sequence[str]) -> list[str]:
-    """Replace the former option `--out` by its present name, except after `--`."""
-    options = list(words)[: words.index("--")] if "--" in words else list(words)
-    said = " ".join(options)
-    name = next((now for verb, now in _FORMER_OUT.items() if said.startswith(verb)), "--results")
-    renamed = [re.sub(r"^--out(?==|$)", name, word) for word in options]
-    return [*renamed, *words[len(options) :]]
-
-
 def _build_launcher(app: App, words: Sequence[str]) -> App:
     """The program as it is started: any verb within the memory limit that is an option of them all."""
 
@@ -181,16 +161,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     keep_current_folder_out()
     silence_warnings()
     gc.set_threshold(_YOUNG)
-    words = _rename_out(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         verb = next(iter(words), "")
         if verb == "help":
             words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
-        if verb in _MOVED:
-            what = f"slip {verb} is now: slip {_MOVED[verb]} {verb}"
-            print_note(f"slip: {what}")
-            refuse_json(words, SlipError("usage", what, hint=f"See slip {_MOVED[verb]} --help"))
-            sys.exit(USAGE)
         code = _build_launcher(build_app(verb), words)(
             words, exit_on_error=False, result_action="return_value"
         )

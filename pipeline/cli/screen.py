@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from pipeline import words
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
@@ -15,9 +16,9 @@ from pipeline.core import (
     INPUT_WORDS,
     format_count,
     format_duration,
+    format_errors,
     format_interval,
     format_recorded,
-    format_share,
     format_size,
     mapping_in,
     number_in,
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from pipeline.batch.batch_run import Line
-
-    Seen = Mapping[str, object]
 
 
 class SilentWatch:
@@ -342,94 +341,33 @@ def _relative(path: str) -> str:
 _EVENTS_SHOWN = 5
 
 
-def format_watch(seen: Seen) -> list[str]:
-    """What is known of a log that is being written, as lines of a screen.
+def format_watch(look: Mapping[str, Any]) -> list[str]:
+    """What is known of a recording that is being written, as lines of a screen.
 
     Args:
-        seen: the object of `Watch.to_json`.
+        look: an object of `pipeline.live.follow`.
     """
-    lines, last = [], ""
-    for label, text in list_statements(seen):
-        lines.append(f"{'' if label == last else label:<10}{text}")
-        last = label
-    return lines
-
-
-def list_statements(seen: Seen) -> list[tuple[str, str]]:
-    """What is known of a log that is being written: a label and a text each, for screen and page.
-
-    Args:
-        seen: the object of `Watch.to_json`.
-    """
-    knowledge = cast("Seen", seen["knowledge"])
-    state = "closed" if seen["closed"] else "being written"
-    size = format_size(cast("float", seen["bytes"]))
-    duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
+    slip = ", ".join(f"{value:.3g} m/s {INPUT_WORDS[name]}" for name, value in look["slip"].items())
+    errors = [math.nan if one is None else one for one in (look["error"] or {}).values()]
     rows = [
-        ("watching", f"{seen['log']}    {state}"),
-        ("server", str(seen.get("source") or "")),
-        ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size}"),
-        ("slip", _format_slip_now(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
-        ("error", _format_model_error(seen)),
+        ("watching", f"{look['log']}    {'closed' if look['closed'] else 'being written'}"),
+        ("so far", format_duration(look["t_s"])),
+        ("slip", slip and f"{slip} (median)"),
+        ("error", errors and f"{format_errors(*errors)} over 2 s with the model so far"),
+        *(("known", f"{one['effect']}: {one['parameter']} {_format_known(one)}") for one in look["known"]),
+        *(("events", f"{one['t_start']:.1f} s: {one['text']}") for one in look["events"][-_EVENTS_SHOWN:]),
+        *(("drive", text) for text in look["drive_next"]),
+        ("enough", "all effects are known within 5 %: no more driving is needed" * look["enough"]),
+        ("not yet", look["problem"]),
     ]
-    events = cast("Sequence[Seen]", seen["events"])
-    rows += [
-        ("events", f"{event['t_start']:.1f} to {event['t_end']:.1f} s: {event['text']}")
-        for event in events[-_EVENTS_SHOWN:]
+    shown = [(label, text) for label, text in rows if text]
+    labels = ["", *(label for label, _ in shown)]
+    return [
+        _row("" if label == last else label, text) for last, (label, text) in zip(labels, shown, strict=False)
     ]
-    rows += _format_knowledge(knowledge)
-    if seen["problem"]:
-        rows.append(("not yet", str(seen["problem"])))
-    if not seen["closed"]:
-        rows.append(("looked", _format_looks(seen, knowledge)))
-    return [(label, text) for label, text in rows if text]
 
 
-def _format_slip_now(medians: Mapping[str, float], when: str) -> str:
-    parts = [f"{value:.3g} m/s {INPUT_WORDS.get(name, name)}" for name, value in medians.items()]
-    return f"{', '.join(parts)} {when}" if parts else ""
-
-
-def _format_model_error(seen: Seen) -> str:
-    """Error of the last model, held out over the log and in the last seconds."""
-    error = cast("Seen", seen["knowledge"]).get("error")
-    now = _format_slip_now(cast("Mapping[str, float]", seen["error_mps"]), "now")
-    return "; ".join(filter(None, [f"{error} over 2 s with the model so far" if error else "", now]))
-
-
-def _format_knowledge(knowledge: Seen) -> list[tuple[str, str]]:
-    alarms = cast("Sequence[Seen]", knowledge.get("alarms") or [])
-    rows = [("alarm", str(alarm["text"])) for alarm in alarms]
-    for stated in cast("Sequence[Seen]", knowledge.get("stated") or []):
-        numbers = cast("Mapping[str, Seen]", stated["parameters"])
-        known = ", ".join(f"{name} {_format_parameter(one)}" for name, one in numbers.items())
-        rows.append(("known", f"{stated['effect']}: {known}"))
-    waiting = cast("Sequence[str]", knowledge.get("waiting") or [])
-    if waiting:
-        rows.append(("not yet", f"to be confirmed by more driving: {', '.join(waiting)}"))
-    rows += [
-        ("not yet", f"undecided: {' or '.join(one)}")
-        for one in cast("Sequence[Sequence[str]]", knowledge.get("undecided") or [])
-    ]
-    if knowledge.get("enough"):
-        return [*rows, ("enough", "all effects are known within 5 %: no more driving is needed")]
-    if knowledge.get("data"):
-        rows.append(("data", str(knowledge["data"])))
-    rows += [("drive", one) for one in cast("Sequence[str]", knowledge.get("drive") or [])]
-    if knowledge.get("problem"):
-        rows.append(("not yet", str(knowledge["problem"])))
-    return rows
-
-
-def _format_parameter(number: Seen) -> str:
-    value, low, high, share = (cast("float | None", number[key]) for key in ("value", "low", "high", "share"))
-    if value is None or low is None or high is None or share is None:
+def _format_known(one: Mapping[str, Any]) -> str:
+    if one["low"] is None or one["high"] is None:
         return "not determined"
-    return f"{format_interval(value, low, high, number['unit'])} (known to {format_share(share)})"
-
-
-def _format_looks(seen: Seen, knowledge: Seen) -> str:
-    until = cast("float | None", knowledge.get("until_s"))
-    parts = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
-    parts += ["diagnosing now"] if seen["diagnosing"] else []
-    return f"{', '.join(parts)}; CPU {format_share(cast('float', seen['cpu_share']))} of a core"
+    return str(format_interval(one["value"], one["low"], one["high"], one["unit"]))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json as json_format
-import re
 import shlex
-import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -48,13 +45,11 @@ from pipeline.core import (
     format_share,
     format_size,
     name_first,
-    naming_os_errors,
     shorten,
 )
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import Outcome
-    from pipeline.live.watch import Watch
     from pipeline.recording import Recording
     from pipeline.recording.inspection import Inspection, TopicHealth
     from pipeline.stages import PoseRating
@@ -412,190 +407,45 @@ def stage(  # noqa: D417 - the shared choices document themselves
     return LOSSY if outcome.lossy else CLEAN
 
 
-_QUIET_S = 30.0
 _CLEAR = "\x1b[H\x1b[2J"
-_LABEL = 10
-"""Columns of a label on a screen, with the space after it."""
-_LABELLED = re.compile(r"(?:[a-z]+(?: [a-z]+)?)? +")
-"""A label, or none: sentences begin with a large letter, names of runs are longer."""
 """Escape sequence that moves the cursor to the top left corner and clears the screen."""
 
 
 def watch(  # noqa: D417 - the shared choices document themselves
-    log: Annotated[
-        Path,
-        Parameter(
-            help="MCAP file that is being recorded, the folder it is written to, or the address of a server: "
-            "ws://127.0.0.1:8765"
-        ),
-    ],
+    log: Annotated[Path, Parameter(help="MCAP file that is being recorded, or the folder it is written to")],
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
-    quiet_for: Annotated[
-        PositiveFloat, Parameter(name="--for", help="end after this many seconds without new data")
-    ] = _QUIET_S,
-    page: Annotated[
-        Path | None, Parameter(help="also write a page to this file, which reloads itself in a browser")
-    ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Parameter(
-            negative=(), help="of a server: record this topic, NAME or NAME=TYPE; can be given several times"
-        ),
-    ] = None,
-    record: Annotated[
-        Path | None, Parameter(help="of a server: folder of the recording; by default named by port and time")
-    ] = None,
+    every: PositiveFloat = 10.0,
+    quiet_for: Annotated[PositiveFloat, Parameter(name="--for")] = 30.0,
     json: bool = False,
 ) -> int:
-    """Diagnose a recording while it is written.
+    """Analyze a recording again and again while it is written.
 
-    Ends when the log is closed, with the diagnosis of the finished log, or on Ctrl-C, with what is known so
-    far. An address is that of a Foxglove WebSocket or rosbridge server on this machine, whose messages are
-    recorded.
+    Shows what is known so far, and what to drive for the rest, until the recording is closed or Ctrl-C.
 
     Args:
+        every: shortest time from one look to the next [s]; a look takes a third of a core at most.
+        quiet_for: end after this many seconds without new data.
         json: print one JSON object a line instead of the screen.
     """
-    watching: list[Watch] = []
-    with contextlib.ExitStack() as receiving:
-        receiving.enter_context(_stopping_at_once(watching))
-        from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-        from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
-        from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
-
-        options = build_options(choices)
-        address = parse_address(str(log))
-        live = None
-        if address is not None:
-            live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
-        path = choose_recording(log) if live is None else live.path
-        arguments = shlex.split(spell_choices(replace(choices, results=Choices().results)))
-        watched = Watch(path, options, arguments, quiet_for, live)
-        watching.append(watched)
-        is_screen = sys.stdout.isatty() and not json
-        reported = ""
-        try:
-            for seen in watched.follow():
-                try:
-                    _show(seen, page, json=json, is_screen=is_screen)
-                    write_statement(choices.results, path, list_statements(seen))
-                except BrokenPipeError:
-                    raise
-                except (SlipError, OSError) as error:
-                    # A disk may be full or a folder gone: the recording is worth more than what is shown.
-                    if str(error) != reported:
-                        reported = str(error)
-                        print_note(f"slip: {reported} The watch goes on.")
-        except KeyboardInterrupt:
-            return _stop(watched, choices.results, page, json=json)
-    if watched.live.problem and not watched.live.slip_mps:
-        print_note(f"slip: no slip was seen: {watched.live.problem}")
-    return _conclude(watched, choices, page, json=json)
-
-
-_LEAVE_S = 1.8
-"""Time after Ctrl-C after which a watch ends whatever is still being read [s]."""
-
-
-@contextlib.contextmanager
-def _stopping_at_once(watching: Sequence[Watch]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM, by which service managers stop programs, end a watch within two seconds."""
-
-    def stop(*_: object) -> None:
-        # The system ends the process then, whatever it does. As after a kill, what was stored is intact.
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, _LEAVE_S)
-        for watched in watching:
-            watched.close()
-        raise KeyboardInterrupt
-
-    try:
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:
-        # Only the main thread has signals.
-        yield
-        return
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _stop(watched: Watch, results: Path, page: Path | None, *, json: bool) -> int:
-    """Say what is known so far: judging the whole log takes longer than somebody waits who presses Ctrl-C."""
-    from pipeline.cli.screen import format_watch, list_statements  # noqa: PLC0415 - heavy
-    from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
-
-    seen = watched.to_json()
-    lines = format_watch(seen)
-    following = f"slip diagnose {shlex.quote(str(watched.path))}"
-    print_note(f"slip: stopped watching; this is what was known so far, {following} judges the whole log")
-    if json:
-        alarms = cast("Content", seen["knowledge"]).get("alarms") or []
-        answer = {"kind": "final", "stopped": True, "alarms": alarms, "runs": [], "errors": [], **seen}
-        sys.stdout.write(json_format.dumps(answer, allow_nan=False) + "\n")
-    else:
-        print_lines(lines)
-    sys.stdout.flush()
-    if page is not None:
-        _write_page(page, lines, is_live=False)
-    write_statement(results, watched.path, list_statements(seen), ended=True)
-    return CLEAN
-
-
-def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
-    """Show the current state: a JSON line, the redrawn screen, or lines; and the page."""
     from pipeline.cli.screen import format_watch  # noqa: PLC0415 - heavy
+    from pipeline.live import choose_recording, follow  # noqa: PLC0415 - heavy
 
-    lines = format_watch(seen)
-    if json:
-        sys.stdout.write(json_format.dumps({"kind": "look", **seen}, allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_CLEAR if is_screen else "")
-        print_lines(lines if is_screen else [*lines, ""])
-    sys.stdout.flush()
-    if page is not None:
-        _write_page(page, lines, is_live=True)
-
-
-def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
-    from pipeline.report import render_template  # noqa: PLC0415 - heavy
-    from pipeline.store import replace_file  # noqa: PLC0415 - heavy
-
-    rows = [
-        (label.strip(), line[_LABEL:]) if _LABELLED.fullmatch(label := line[:_LABEL]) else (None, line)
-        for line in lines
-    ]
-    text = render_template("report/templates/watch.html", rows=rows, is_live=is_live)
-    hint = "Check the folder and its permissions."
-    with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=page, hint=hint):
-        replace_file(page, text.encode())
-
-
-def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool) -> int:
-    """Diagnose the whole log, as `slip diagnose` does."""
-    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-    from pipeline.cli.verbs_effects import Diagnosed, diagnose_logs  # noqa: PLC0415 - heavy
-    from pipeline.live.running_log import list_alarms  # noqa: PLC0415 - heavy
-    from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
-
-    diagnosed, logs = Diagnosed(), [str(watched.path)]
-    diagnose_logs(diagnosed, logs, build_options(choices), quiet=json)
-    alarms = [alarm for run in diagnosed.runs for alarm in list_alarms(run.effects)]
-    lines = diagnosed.list_lines(logs, spell_choices(choices))
-    lines += [f"alarm     {alarm['text']}" for alarm in alarms]
-    rows = [("", line) for line in lines]
-    if json:
-        answer = {"kind": "final", "stopped": False, "alarms": alarms, **diagnosed.to_json()}
-        sys.stdout.write(json_format.dumps(answer) + "\n")
-        rows = list_statements(watched.to_json())
-    else:
-        print_lines(lines)
-    if page is not None:
-        _write_page(page, lines, is_live=False)
-    write_statement(choices.results, watched.path, rows, ended=True)
-    watched.forget()
-    return diagnosed.end(quiet=False)
+    path, problem = choose_recording(log), ""
+    try:
+        for look in follow(path, shlex.split(spell_choices(choices)), every_s=every, quiet_s=quiet_for):
+            problem = look["problem"]
+            if json:
+                sys.stdout.write(json_format.dumps(look, allow_nan=False) + "\n")
+            else:
+                sys.stdout.write(_CLEAR if sys.stdout.isatty() else "")
+                print_lines([*format_watch(look), ""])
+            sys.stdout.flush()
+    except KeyboardInterrupt:
+        print_note("slip: stopped; the recording goes on")
+        return CLEAN
+    if problem:
+        raise SlipError("nothing_known", problem, where=str(path), hint="See `slip inspect` of it")
+    print_note(f"slip: the recording has ended; slip analyze {shlex.quote(str(path))} makes its report")
+    return CLEAN

@@ -1,17 +1,16 @@
-"""Index of a recording's contents, built without decoding messages, and of one that is being written."""
+"""Index of a recording's contents, built without decoding messages."""
 
 import itertools
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, cast
+from typing import Final
 
 from pipeline.core import (
     LONGEST_NAME,
-    PAUSE_NS,
     PathError,
     format_size,
     name_first,
@@ -19,14 +18,12 @@ from pipeline.core import (
     shorten,
     usable_threads,
 )
-from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.compressed import COMPRESSED, uncompressed_name
 from pipeline.logs.other_formats import list_tables
 from pipeline.logs.part import (
     catalog_file,
     count_fetched,
-    examine_spans,
     hash_sources,
     is_finished,
     open_source,
@@ -34,8 +31,6 @@ from pipeline.logs.part import (
 )
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import to_location
-from pipeline.logs.scan import Scanner
-from pipeline.logs.spans import Span
 
 SUFFIXES: Final = (".mcap", *(f".mcap{end}" for end in COMPRESSED), ".db3", ".bag")
 """Suffixes of the files of recordings."""
@@ -427,200 +422,8 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
     )
 
 
-_HEAD_BYTES: Final = 4096
-"""First bytes of a file by which it is known again: they hold the time of its first chunk."""
-
-
-@dataclass
-class _GrowingFile:
-    """One file of a growing recording.
-
-    Attributes:
-        path: the file.
-        catalog: contents of its complete records.
-        offset: first byte of the first incomplete record.
-        size: bytes at the last update.
-        seen: device, inode and time of change at the last update.
-        head: its first bytes.
-        finished: whether the recorder has finished it.
-    """
-
-    path: Path
-    catalog: Catalog = field(default_factory=Catalog)
-    offset: int = len(rec.MAGIC)
-    size: int = 0
-    seen: tuple[int, int, int] = (0, 0, 0)
-    head: bytes = b""
-    finished: bool = False
-
-    def follow(self) -> bool:
-        """Scan the data that was added; returns whether there is any."""
-        try:
-            state = self.path.stat()
-        except FileNotFoundError as error:
-            what = "the file was removed while it was watched"
-            hint = "Leave the files of a recording where they are until it ends"
-            raise LogError("log_changed", what, where=str(self.path), hint=hint) from error
-        size, seen, before = state.st_size, (state.st_dev, state.st_ino, state.st_mtime_ns), self.seen
-        if size < self.size:
-            what = "the file became shorter while it was watched: it was replaced, or is not being recorded"
-            raise LogError("log_changed", what, where=str(self.path), hint="Start the watch again")
-        if seen == before or size < len(rec.MAGIC):
-            return False
-        with open_source(self.path) as source:
-            head = source.read_at(0, min(size, _HEAD_BYTES))
-            if self.head and (seen[:2] != before[:2] or not head.startswith(self.head)):
-                what = "the file was replaced by another while it was watched"
-                raise LogError("log_changed", what, where=str(self.path), hint="Start the watch again")
-            self.seen, self.head = seen, head
-            if size == self.size:
-                return False
-            self.finished, self.size = is_finished(self.path), size
-            if source.read_at(0, len(rec.MAGIC)) != rec.MAGIC:
-                what = "only MCAP files can be watched while they are written, and this is not one"
-                hint = "Record with `ros2 bag record -s mcap`, or analyze the log when it is complete"
-                raise LogError("not_mcap", what, where=str(self.path), hint=hint)
-            known = self.catalog
-            # Schemas and channels are shared: the first ones also decode later messages.
-            fresh = Catalog(
-                profile=known.profile,
-                library=known.library,
-                schemas=known.schemas,
-                channels=known.channels,
-                covers=known.covers,
-                contradicted=known.contradicted,
-                extras=known.extras,
-            )
-            self.offset = Scanner(source, fresh).follow(self.offset, self.size)
-            examine_spans(source, fresh, usable_threads())
-        self.catalog = _join(known, fresh)
-        return True
-
-
-def _join(known: Catalog, fresh: Catalog) -> Catalog:
-    """Catalog of a file, extended by the data that was added."""
-    starts = [one for one in (known.start_ns, fresh.start_ns) if one is not None]
-    ends = [one for one in (known.end_ns, fresh.end_ns) if one is not None]
-    numbers = known.counts.keys() | fresh.counts.keys()
-    return replace(
-        fresh,
-        spans=known.spans + fresh.spans,
-        compressions=known.compressions | fresh.compressions,
-        metadata=known.metadata + fresh.metadata,
-        attachments=known.attachments + fresh.attachments,
-        counts={number: known.counts.get(number, 0) + fresh.counts.get(number, 0) for number in numbers},
-        start_ns=min(starts, default=None),
-        end_ns=max(ends, default=None),
-        losses=known.losses + fresh.losses,
-    )
-
-
-class GrowingLog:
-    """A recording that is followed while it is written: a file, or the folder of a split recording.
-
-    It stores the positions of chunks, never their messages: memory grows by some hundred bytes per chunk.
-    An incomplete record at the end is not damage: it is read once it is complete.
-
-    Args:
-        path: an MCAP file, or a folder of the files of one recording.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._files: dict[Path, _GrowingFile] = {}
-        self._end_s = 0.0
-
-    @property
-    def note(self) -> str:
-        """Status of the recording's source; empty for a file."""
-        return ""
-
-    @property
-    def cpu_s(self) -> float:
-        """CPU time of the process that writes it for the watch [s]; 0 for a file written by others."""
-        return 0.0
-
-    def update(self) -> bool:
-        """Scan the data added since the last call; returns whether there is any.
-
-        Raises:
-            LogError: ``log_not_found``, ``not_a_recording``, ``not_mcap``, ``log_changed``,
-                ``log_unreadable``.
-        """
-        if not self.path.exists():
-            raise LogError(
-                "log_not_found", "there is no such file", where=str(self.path), hint="Check the path"
-            )
-        for path in find_parts(self.path)[0]:
-            self._files.setdefault(path, _GrowingFile(path))
-        grown = [file.follow() for file in self._files.values()]
-        if any(grown):
-            self._end_s = sum(_measure_lengths(self._list_spans())) * 1e-9
-        return any(grown)
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the recorder has finished it; a split recording ends with its `LISTING`."""
-        files = self._files.values()
-        listed = not self.path.is_dir() or (self.path / LISTING).exists()
-        return bool(files) and listed and all(file.finished for file in files)
-
-    @property
-    def size(self) -> int:
-        """Total size of its files [bytes]."""
-        return sum(file.size for file in self._files.values())
-
-    @property
-    def end_s(self) -> float:
-        """Recorded time so far [s], whatever the clock of the log times was set to meanwhile."""
-        return self._end_s
-
-    def _list_spans(self) -> list[Span]:
-        """Chunks with known times, in the order in which they were written."""
-        spans = (span for file in self._files.values() for span in file.catalog.spans)
-        return [span for span in spans if span.end_ns is not None]
-
-    def make_index(self, seconds: float | None = None) -> LogIndex:
-        """Index of the recording so far.
-
-        Args:
-            seconds: approximate length of the part at the end to index [s]; None for all.
-        """
-        chosen: set[int] | None = None
-        if seconds is not None:
-            spans = self._list_spans()
-            ends = list(itertools.accumulate(_measure_lengths(spans)))
-            since = ends[-1] - seconds * 1e9 if ends else 0.0
-            chosen = {id(span) for span, end in zip(spans, ends, strict=True) if end >= since}
-        parts = [
-            Part(file.path, file.size, _cut(file.catalog, chosen), None)
-            for file in self._files.values()
-            if file.catalog.spans or len(self._files) == 1
-        ]
-        return merge_parts(self.path, parts, (), 0)
-
-
 def take_start(index: LogIndex, chunks: int) -> LogIndex:
     """Index of the first chunks of each file alone, for what every message of a topic repeats."""
     starts = (replace(part.catalog, spans=part.catalog.spans[:chunks]) for part in index.parts)
     parts = tuple(replace(part, catalog=start) for part, start in zip(index.parts, starts, strict=True))
     return replace(index, parts=parts)
-
-
-def _cut(catalog: Catalog, chosen: set[int] | None) -> Catalog:
-    """Catalog without the other chunks with known times; it shares its dictionaries with the original."""
-    spans = [one for one in catalog.spans if chosen is None or one.end_ns is None or id(one) in chosen]
-    return replace(catalog, spans=spans)
-
-
-def _measure_lengths(spans: Iterable[Span]) -> Iterator[int]:
-    """Recorded time that each chunk adds to those before it [ns]; a clock that was set adds none."""
-    last: int | None = None
-    for span in spans:
-        start, end = cast("int", span.start_ns), cast("int", span.end_ns)
-        if last is None or abs(end - last) > PAUSE_NS:
-            yield end - start if end - start <= PAUSE_NS else 0
-            last = end
-        else:
-            yield max(end - last, 0)
-            last = max(end, last)

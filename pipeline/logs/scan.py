@@ -68,31 +68,6 @@ class Scanner:
                 after, position = self._recover(previous, position, stop)
             previous, position = position, after
 
-    def follow(self, start: int, stop: int) -> int:
-        """Scan the records in [start, stop) of a file that is being written.
-
-        Returns:
-            Offset of the incomplete record at the end, or ``stop``; damage before it is recorded as a loss.
-        """
-        position = previous = start
-        while position < stop:
-            after = self._take(position, stop)
-            if after is None:
-                if self._may_grow(position, stop):
-                    break
-                after, position = self._recover(previous, position, stop)
-            previous, position = position, after
-        return position
-
-    def _may_grow(self, position: int, stop: int) -> bool:
-        """Whether a record at ``position`` may be incomplete: of a valid kind, and ending after ``stop``."""
-        head = self._window.view(position, rec.HEAD_SIZE)
-        if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
-            return True
-        opcode, length = rec.HEAD.unpack(head)
-        end: int = position + rec.HEAD_SIZE + length
-        return (opcode in rec.LEAST_BODY or opcode >= FIRST_PRIVATE) and end > stop
-
     def _take(self, position: int, stop: int) -> int | None:
         """Add the record at ``position`` to the catalog; returns the offset after it, None if invalid."""
         head = self._window.view(position, rec.HEAD_SIZE)

@@ -45,9 +45,6 @@ MAX_LEAVES: Final = 1 << 14
 _MAX_DEFINITION: Final = 1 << 18
 """Maximum length of a definition with all nested types [characters]; those of a robot have thousands."""
 
-_MAX_NESTED: Final = 1 << 10
-"""Maximum number of opening brackets of an IDL definition: its parser calls itself for each."""
-
 _ALIASES: Final = {"byte": "uint8", "char": "uint8", "octet": "uint8", "boolean": "bool"}
 _ALIASES_ROS1: Final = {"byte": "int8", "char": "uint8"}
 _RULE: Final = f"\n{'=' * 80}\n"
@@ -118,6 +115,12 @@ _HIDDEN: Final = re.compile(
 """Strings and comments; an unclosed one extends to the end of the text, so that matching is linear."""
 
 
+_ANNOTATION: Final = re.compile(r"@\s*+[\w:]++(?:\s*+\([^()]*+\))?")
+
+_COSTLY: Final = re.compile(r"[(*]|<<|\]\s*+\[|sequence\s*+<\s*+sequence\b")
+"""What costs the parser exponential time or memory; no definition that ROS makes has any of it."""
+
+
 def parse_idl(name: str, text: str) -> Structure:
     """Parse concatenated IDL definitions.
 
@@ -129,8 +132,9 @@ def parse_idl(name: str, text: str) -> Structure:
         SchemaError: as `parse_msg`.
     """
     plain = _HIDDEN.sub(lambda match: '""' if match["string"] else " ", text)
-    if sum(map(plain.count, "{([")) > _MAX_NESTED or "<<" in plain or "*" in plain:
-        raise SchemaError("it holds many brackets, or constants that must be computed")
+    plain = _ANNOTATION.sub(" ", plain)
+    if _COSTLY.search(plain):
+        raise SchemaError("it holds brackets in brackets, or numbers that must be computed")
     parts = [part for part in _SEPARATOR.split(plain) if part.strip()]
     parsed = [message for part in parts for message in _parse(IDLParser, part)]
     return _resolve(name, parsed)

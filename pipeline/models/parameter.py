@@ -310,8 +310,6 @@ class Parameter:
         instead_of: the parameter that this one replaces once it is given; this one is not searched.
         quantities: quantities of controllers that it determines; empty where there are none.
         between_runs: variation from run to run; None where it was not measured.
-        learned_within: range in which learners on board let it go, beyond which `slip watch` raises an alarm;
-            None where no such learner is known.
         level: what it is a property of by its nature, as a controller's gain of the vehicle; None if open.
     """
 
@@ -332,7 +330,6 @@ class Parameter:
     instead_of: str = ""
     quantities: tuple[Quantity, ...] = ()
     between_runs: Spread | None = None
-    learned_within: Plausible | None = None
     level: Level | None = None
 
     def __post_init__(self) -> None:

@@ -66,20 +66,19 @@ class LogSetup:
         return self.sources.pose is not None and self.sources.pose.wheels is not None
 
 
-def set_up_log(path: Path, options: LogOptions, index: LogIndex | None = None) -> LogSetup:
+def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     """Open a log and determine configuration, vehicle and topics.
 
     Args:
         path: the recording.
         options: options of the user.
-        index: index of the log, if it has been read already.
 
     Raises:
         LogError: the log cannot be read.
         ConfigurationError: the configuration is wrong or the vehicle unknown.
         RecordingError: the log has no pose, or neither command nor measured wheels.
     """
-    index = index or open_log(path, max_inflated=options.max_inflated)
+    index = open_log(path, max_inflated=options.max_inflated)
     path = index.path
     configuration = load_configuration(
         path, given=options.config, fleet=options.fleet, overrides=options.overrides

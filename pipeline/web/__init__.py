@@ -263,6 +263,8 @@ _HOW_TO_ENTER = (
 )
 
 _REFUSED = 403
+_ENTRANCE = "/"
+"""The page that the token in the address opens."""
 _SAFE = ("GET", "HEAD")
 _OWN_SITES = ("same-origin", "none")
 _HEAD = (
@@ -270,9 +272,6 @@ _HEAD = (
     '<meta name="viewport" content="width=device-width, initial-scale=1">'
     '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
 )
-
-_ENTRANCES = ("/", "/live")
-"""Pages that the token in the address opens."""
 
 
 def make_token() -> str:
@@ -333,12 +332,12 @@ class Guard:
             return None
         # Cookies are shared between ports: every workbench on a host needs its own cookie name.
         cookie = f"slip-{scope['server'][1]}"
-        path, given = scope["path"], QueryParams(scope["query_string"]).get("token", "")
-        if path in _ENTRANCES and self._is_token(given):
+        given = QueryParams(scope["query_string"]).get("token", "")
+        if scope["path"] == _ENTRANCE and self._is_token(given):
             # The page is opened by a second request: that removes the token from the address, and the browser
             # treats later requests as same-site, wherever the link was. The script keeps the selected run.
             welcome = HTMLResponse(
-                f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url={path}"></noscript>'
+                f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url={_ENTRANCE}"></noscript>'
                 '<script src="/enter.js"></script></head><body></body></html>'
             )
             welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
@@ -369,7 +368,7 @@ class Guard:
         navigates = (
             scope["method"] in _SAFE
             and headers.get("sec-fetch-mode") == "navigate"
-            and (scope["path"] in _ENTRANCES or _shows_page(scope))
+            and (scope["path"] == _ENTRANCE or _shows_page(scope))
         )
         if headers.get("sec-fetch-site", "same-origin") not in _OWN_SITES and not navigates:
             return "the request comes from another site"
@@ -400,7 +399,7 @@ def strip_port(host: str) -> str:
 
 
 def _refuse(scope: Scope, code: str, why: str) -> Response:
-    if scope["path"] in _ENTRANCES:
+    if scope["path"] == _ENTRANCE:
         sentence = f"{why[0].upper()}{why[1:]}."
         return HTMLResponse(f"{_HEAD}</head><body><p>{sentence}</p></body></html>", status_code=_REFUSED)
     return JSONResponse({"error": {"code": code, "message": why}}, status_code=_REFUSED)

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import os
 import socket
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
@@ -23,7 +22,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
 from pipeline.core import PathError, resolve_inside
-from pipeline.live.watch import read_statements
 from pipeline.report import CATALOGUE, PAGES, PLANS, is_page
 from pipeline.report.drive_pages import PREVIEW
 from pipeline.report.theme import load_bundle, warm_bundle
@@ -230,7 +228,6 @@ _SCRIPTS = {
         "parts",
         "plan",
         "difference",
-        "live",
     ),
     "pipeline.report": ("cursor", "marks", "plots"),
 }
@@ -265,7 +262,6 @@ class Web:
         }
         return [
             Route("/", _serve_own("pipeline.web", "page.html", "text/html")),
-            Route("/live", _serve_own("pipeline.web", "live.html", "text/html")),
             Route("/page.css", _serve_own("pipeline.web", "page.css", "text/css")),
             *(
                 Route(f"/{name}.js", _serve_own(package, f"{name}.js", "text/javascript"))
@@ -279,7 +275,6 @@ class Web:
             *(Route(f"/{top}/{{place:path}}", self.page) for top in ("runs", PLANS)),
             Route("/api/runs", self.runs),
             Route("/api/jobs", self.jobs),
-            Route("/api/live", self.live),
             *(Route(f"/api/{name}", _serve_asked(do), methods=["POST"]) for name, do in asked.items()),
             Route("/api/upload", self.upload, methods=["POST"]),
             Route("/plan", self.plan_file),
@@ -300,16 +295,6 @@ class Web:
     async def jobs(self, _: Request) -> Response:
         """All jobs."""
         return answer({"jobs": self._sessions.jobs.show()})
-
-    async def live(self, _: Request) -> Response:
-        """Last outputs of `slip watch` for the recordings it follows, with their age [s]."""
-        statements = await run_in_threadpool(read_statements, self._sessions.store)
-        now = time.time()
-        watched = [
-            {"log": said.log, "rows": said.rows, "ended": said.ended, "age_s": max(now - said.time, 0.0)}
-            for said in statements
-        ]
-        return answer({"watched": watched})
 
     async def download(self, request: Request) -> Response:
         """The model file of a session."""

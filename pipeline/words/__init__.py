@@ -30,7 +30,6 @@ if TYPE_CHECKING:
         list_terms,
     )
     from pipeline.words.effects import (
-        describe_alarm,
         describe_cause,
         describe_clause,
         describe_motion,

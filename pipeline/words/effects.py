@@ -4,14 +4,13 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
-from pipeline.core import format_digits, format_interval, round_digits, split_interval, suffix_unit
+from pipeline.core import format_interval, round_digits, split_interval, suffix_unit
 from pipeline.models import (
     AT_BOUND,
     UNDETERMINED,
     Effect,
     Late,
     Level,
-    Parameter,
     Reading,
     find_effect,
     list_effects,
@@ -192,21 +191,3 @@ def format_with_range(value: Value) -> str:
 def format_numbers(numbers: Mapping[str, Value]) -> str:
     """Values of an effect by parameter, with their intervals."""
     return ", ".join(f"{name} = {format_value(value)}" for name, value in numbers.items())
-
-
-def describe_alarm(effect: str, parameter: Parameter, value: float) -> str:
-    """A number that is beyond the range in which learners on board let it go; empty without a range.
-
-    Args:
-        effect: id of the effect.
-        parameter: the parameter.
-        value: in the unit of the parameter.
-    """
-    within, unit = parameter.learned_within, suffix_unit(parameter.unit)
-    if within is None:
-        return ""
-    low, high = format_digits(within.low), format_digits(within.high)
-    return (
-        f"{effect}: {parameter.name} = {format_digits(value, 3)}{unit} is outside of {low} to {high}{unit} "
-        f"({within.source}): no controller should use it before the vehicle is examined"
-    )

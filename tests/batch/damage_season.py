@@ -157,7 +157,17 @@ def run_batch(logs: Path, out: Path) -> tuple[int, dict[str, object], str]:
     from pipeline.batch import recordings  # noqa: PLC0415 - the repository is put on the path first
     from pipeline.cli import main as slip  # noqa: PLC0415
 
-    arguments = ["batch", str(logs), "--out", str(out), "--executor", "inline", "--settle", "600", "--json"]
+    arguments = [
+        "batch",
+        str(logs),
+        "--results",
+        str(out),
+        "--executor",
+        "inline",
+        "--settle",
+        "600",
+        "--json",
+    ]
     said, errors = io.StringIO(), io.StringIO()
     defaults = recordings.find_recordings.__kwdefaults__
     with (

@@ -121,7 +121,7 @@ def test_killed_at_random_moments(
 def test_whole_commands_killed_with_their_workers_at_random_moments(
     field: Path, tmp_path: Path, undisturbed: dict[str, bytes]
 ) -> None:
-    command = ("batch", field, "--jobs", "2", "--settle", "0", "--quiet", "--out")
+    command = ("batch", field, "--jobs", "2", "--settle", "0", "--quiet", "--results")
     started = time.monotonic()
     start_slip(*command, tmp_path / "timed").communicate()
     longest_s = time.monotonic() - started
@@ -195,7 +195,9 @@ def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
 
 
 def test_workers_end_with_their_batch(field: Path, tmp_path: Path) -> None:
-    process = start_slip("batch", field, "--out", tmp_path / "out", "--jobs", "2", "--settle", "0", "--quiet")
+    process = start_slip(
+        "batch", field, "--results", tmp_path / "out", "--jobs", "2", "--settle", "0", "--quiet"
+    )
     deadline = time.monotonic() + 30.0
     while not list((tmp_path / "out").glob("runs/*/*/manifest.json")) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -224,7 +226,8 @@ def test_two_batches_at_once_do_every_log_once(
 ) -> None:
     out = tmp_path / "out"
     both = [
-        start_slip("batch", field, "--out", out, "--jobs", "1", "--settle", "0", "--json") for _ in range(2)
+        start_slip("batch", field, "--results", out, "--jobs", "1", "--settle", "0", "--json")
+        for _ in range(2)
     ]
     answers = [process.communicate(timeout=120) for process in both]
     assert [process.returncode for process in both] == [3, 3], answers

@@ -279,7 +279,7 @@ def test_a_bucket_of_a_stranger_writes_nothing_outside_of_its_mirror(
     for arguments in (
         ("results", "status", out),
         ("results", "verify", out),
-        ("results", "query", "SELECT 1", "--out", out),
+        ("results", "query", "SELECT 1", "--results", out),
     ):
         code, _, told = run_slip(*arguments)
         assert code == 1

@@ -140,7 +140,7 @@ def test_a_name_that_is_no_text_passes_through_everything(odd: Path, tmp_path: P
         ["results", "explain", str(odd)],
         ["batch", str(odd)],
     ):
-        code, said, told = run_slip(*arguments, "--out", out)
+        code, said, told = run_slip(*arguments, "--results", out)
         assert code == 0, told
         (said + told).encode()
     assert ask_verb("inspect", odd)["path"] == str(odd)

@@ -28,7 +28,7 @@ def make_nightly(season: Path, tmp_path: Path) -> Nightly:
     folder.mkdir()
     return Nightly(
         program=(sys.executable, "-m", "pipeline"),
-        arguments=(str(season / "a.mcap"), "--out", "my results", "--settle", "0"),
+        arguments=(str(season / "a.mcap"), "--results", "my results", "--settle", "0"),
         folder=folder,
         lock=folder / "lock",
         hour=3,

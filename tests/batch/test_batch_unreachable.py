@@ -23,7 +23,7 @@ VERBS = {
     "batch of one": ("batch", LOG),
     "batch of a glob": ("batch", "s3://nobody/logs/*.mcap"),
     "status": ("results", "status", "s3://nobody/results"),
-    "query": ("results", "query", "SELECT * FROM runs", "--out", "s3://nobody/results"),
+    "query": ("results", "query", "SELECT * FROM runs", "--results", "s3://nobody/results"),
     "verify": ("results", "verify", "s3://nobody/results"),
 }
 

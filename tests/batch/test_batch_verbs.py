@@ -17,8 +17,8 @@ def test_a_name_that_begins_with_a_dash_goes_behind_two(
 ) -> None:
     (season / "a.mcap").rename(season / "-a.mcap")
     monkeypatch.chdir(season)
-    assert run_slip("batch", "-a.mcap", "--out", tmp_path / "out", *INLINE)[0] == 2
-    assert run_slip("batch", "--out", tmp_path / "out", *INLINE, "--", "-a.mcap")[0] == 0
+    assert run_slip("batch", "-a.mcap", "--results", tmp_path / "out", *INLINE)[0] == 2
+    assert run_slip("batch", "--results", tmp_path / "out", *INLINE, "--", "-a.mcap")[0] == 0
     assert "--" in run_slip("batch", "--help")[1].split("dash")[0][-60:]
 
 
@@ -37,7 +37,7 @@ def test_schedule_prints_units_of_this_folder(monkeypatch: pytest.MonkeyPatch, t
         "batch",
         "schedule",
         "logs",
-        "--out",
+        "--results",
         "results",
         "--jobs",
         "4",

@@ -84,10 +84,10 @@ def test_the_script_does_not_look_there(trap: Path) -> None:
 
 @pytest.mark.long
 def test_no_verb_imports_from_the_current_folder(trap: Path) -> None:
-    run_in(trap, [SLIP, "analyze", "run.mcap", "--out", "results", "--no-diagnosis"])
+    run_in(trap, [SLIP, "analyze", "run.mcap", "--results", "results", "--no-diagnosis"])
     assert list((trap / "cache").rglob("vega-*.js"))
-    run_in(trap, [SLIP, "batch", "run.mcap", "--out", "many", "--jobs", "2", "--settle", "0"])
-    unit = run_in(trap, [SLIP, "batch", "schedule", "--settle", "0", "run.mcap", "--out", "nightly"])
+    run_in(trap, [SLIP, "batch", "run.mcap", "--results", "many", "--jobs", "2", "--settle", "0"])
+    unit = run_in(trap, [SLIP, "batch", "schedule", "--settle", "0", "run.mcap", "--results", "nightly"])
     (line,) = [line for line in unit.splitlines() if line.startswith("ExecStart=")]
     run_in(trap, shlex.split(line.removeprefix("ExecStart=")), codes=(0, 3))
     assert (trap / "nightly").exists()
@@ -95,7 +95,7 @@ def test_no_verb_imports_from_the_current_folder(trap: Path) -> None:
 
 @pytest.mark.long
 def test_the_workbench_s_diagnosis_does_not_look_there(trap: Path) -> None:
-    run_in(trap, [SLIP, "analyze", "run.mcap", "--out", "results", "--no-diagnosis", "--no-report"])
+    run_in(trap, [SLIP, "analyze", "run.mcap", "--results", "results", "--no-diagnosis", "--no-report"])
     program = """import sys
 sys.path.pop(0)
 import json

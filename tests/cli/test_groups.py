@@ -1,4 +1,4 @@
-"""The commands by task: what moved says where to, and an option means the same everywhere."""
+"""The commands by task, and an option means the same everywhere."""
 
 import inspect
 import json
@@ -11,19 +11,6 @@ from verbs import run_program, run_verb
 
 from pipeline.cli import build_app
 from pipeline.simulate import simulate_case
-
-MOVED = {
-    "predict": "fleet predict",
-    "trend": "fleet trend",
-    "map": "fleet map",
-    "share": "fleet share",
-    "status": "results status",
-    "verify": "results verify",
-    "explain": "results explain",
-    "query": "results query",
-    "stage": "results stage",
-    "schedule": "batch schedule",
-}
 
 
 def list_apps(app: App, words: str = "") -> Iterator[tuple[str, App]]:
@@ -41,17 +28,6 @@ def list_options(app: App) -> set[str]:
     return {name for argument in arguments for name in argument.names}
 
 
-@pytest.mark.parametrize("old", MOVED)
-def test_a_command_that_moved_names_its_new_place(old: str, tmp_path: Path) -> None:
-    done = run_verb(old, "--json", cwd=tmp_path)
-
-    assert done.returncode == 2
-    assert json.loads(done.stdout)["errors"][0]["message"] == f"slip {old} is now: slip {MOVED[old]}"
-    assert done.stderr == f"slip: slip {old} is now: slip {MOVED[old]}\n"
-    assert MOVED[old] in dict(list_apps(build_app()))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> None:
     options = {words: list_options(app) for words, app in list_apps(build_app())}
     without = {words for words, names in options.items() if names and "--results" not in names}
@@ -59,8 +35,6 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
         "batch schedule", "effects", "fleet map merge", "model new", "model new-effect",
         "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
     }  # fmt: skip
-    for names in options.values():
-        assert not names & {"--out", "--known"}
 
 
 def test_no_option_has_a_negative_that_means_nothing() -> None:
@@ -72,19 +46,6 @@ def test_no_option_has_a_negative_that_means_nothing() -> None:
     }
     assert denied == {"--no-diagnosis", "--no-report", "--no-logs", "--no-trend"}
     assert run_verb("effects", "--no-json").returncode == 2
-
-
-def test_out_is_still_understood_as_what_it_was_called_before(tmp_path: Path) -> None:
-    log, out = tmp_path / "a.mcap", tmp_path / "season"
-    assert run_verb("simulate", "husky_tile", "--duration", "8", "--out", log).returncode == 0
-    assert log.is_file()
-    words = ("analyze", log, f"--out={out}", "--no-report", "--no-diagnosis", "--json")
-    assert json.loads(run_verb(*words).stdout)["runs"][0]["same_content_as"] is None
-    again = run_verb("analyze", log, "--results", out, "--no-report", "--no-diagnosis")
-    assert "nothing was computed" in again.stdout
-    assert "--out" not in run_verb("analyze", "--help").stdout
-    # What follows -- is a name, whatever it is.
-    assert "--out: " in run_verb("analyze", "--", "--out").stderr
 
 
 def test_a_batch_has_its_verb_and_does_without(tmp_path: Path) -> None:

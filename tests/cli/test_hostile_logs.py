@@ -43,7 +43,7 @@ def test_a_log_without_checksums_is_called_unchecked_wherever_its_health_is_show
     assert seen.returncode == 0
     assert f"complete, unchecked: {WORDS}" in seen.stdout
     assert json.loads(run_verb("inspect", unchecked, "--json").stdout)["unchecked"] == WORDS
-    done = run_verb("analyze", unchecked, "--out", tmp_path / "out", "--no-diagnosis", "--json")
+    done = run_verb("analyze", unchecked, "--results", tmp_path / "out", "--no-diagnosis", "--json")
     assert done.returncode == 0
     (run,) = json.loads(done.stdout)["runs"]
     assert f"complete (unchecked: {WORDS})" in format_run(run, unchanged=False)
@@ -72,7 +72,7 @@ def test_a_verb_that_only_reads_results_has_a_memory_limit(tmp_path: Path, sampl
 @pytest.mark.parametrize("verb", ["analyze", "diagnose"])
 def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb: str) -> None:
     log = samples / "husky_tile.mcap"
-    done = run_program(verb, log, "--out", tmp_path / "out", "--memory", "200MB", "--json", "--quiet")
+    done = run_program(verb, log, "--results", tmp_path / "out", "--memory", "200MB", "--json", "--quiet")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"slip: {log}: the command used 0.")
@@ -81,7 +81,9 @@ def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb:
     assert content["runs"] == []
     assert [error["code"] for error in content["errors"]] == ["out_of_memory"]
     assert not list(tmp_path.rglob("manifest.json"))
-    after = run_verb("analyze", log, "--out", tmp_path / "out", "--no-diagnosis", "--no-report", "--quiet")
+    after = run_verb(
+        "analyze", log, "--results", tmp_path / "out", "--no-diagnosis", "--no-report", "--quiet"
+    )
     assert (after.returncode, after.stderr) == (0, "")
 
 
@@ -113,7 +115,7 @@ def test_a_log_that_inflates_beyond_its_budget_is_read_up_to_it(bomb: Path, tmp_
     assert plain.returncode == 3
     assert "times its size, and at most" in plain.stdout
     assert "chunks were left out; --max-inflated" in plain.stdout
-    done = run_verb("analyze", bomb, "--out", tmp_path, "--no-diagnosis", "--no-report", "--json")
+    done = run_verb("analyze", bomb, "--results", tmp_path, "--no-diagnosis", "--no-report", "--json")
     assert done.returncode == 3
     (run,) = json.loads(done.stdout)["runs"]
     assert "max_inflated" in json.dumps(run)
@@ -125,7 +127,7 @@ def test_results_of_a_log_that_was_cut_short_are_not_those_of_all_of_it(
     log = samples / "husky_tile.mcap"
 
     def extract(*more: str) -> dict[str, object]:
-        done = run_verb("results", "stage", "extract", log, "--out", tmp_path, "--json", *more)
+        done = run_verb("results", "stage", "extract", log, "--results", tmp_path, "--json", *more)
         assert done.returncode in (0, 3), done.stderr
         return dict(json.loads(done.stdout))
 

@@ -46,13 +46,13 @@ def test_inspect_imports_neither_contracts_nor_what_stores(samples: Path) -> Non
 
 
 def test_slip_tables_are_made_without_a_compiler_and_effects(samples: Path, tmp_path: Path) -> None:
-    words = ("--out", tmp_path, "--no-diagnosis", "--no-report", "--quiet")
+    words = ("--results", tmp_path, "--no-diagnosis", "--no-report", "--quiet")
     unwanted = {"numba", "scipy.optimize", "scipy.spatial", "pipeline.models.catalogue"}
     assert not list_imports("analyze", samples / "husky_tile.mcap", *words) & unwanted
 
 
 def test_stages_and_report_import_no_library_of_charts(samples: Path, tmp_path: Path) -> None:
-    words = ("--out", tmp_path, "--no-diagnosis", "--quiet")
+    words = ("--results", tmp_path, "--no-diagnosis", "--quiet")
     imported = list_imports("analyze", samples / "husky_tile.mcap", *words)
     assert (next(tmp_path.glob("runs/*/*/latest")) / "report.html").is_file()
     assert "pipeline.report.page" in imported
@@ -60,5 +60,5 @@ def test_stages_and_report_import_no_library_of_charts(samples: Path, tmp_path: 
 
 
 def test_one_log_imports_nothing_of_bags_and_servers_to_be_diagnosed(samples: Path, tmp_path: Path) -> None:
-    imported = list_imports("diagnose", samples / "husky_tile.mcap", "--out", tmp_path, "--quiet")
+    imported = list_imports("diagnose", samples / "husky_tile.mcap", "--results", tmp_path, "--quiet")
     assert not imported & ALWAYS

@@ -38,7 +38,7 @@ def test_results_that_do_not_tell_a_vehicle_are_one_line(
     assert isinstance(details, dict)
     told = {**details["vehicle"], **vehicle} if isinstance(vehicle, dict) and vehicle else vehicle
     path.write_bytes(encode_checked({**content, "details": {**details, "vehicle": told}}))
-    assert slip("diagnose", "field/wide", "--out", place / "results") == 1
+    assert slip("diagnose", "field/wide", "--results", place / "results") == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "do not say which vehicle" in line
 
@@ -46,7 +46,16 @@ def test_results_that_do_not_tell_a_vehicle_are_one_line(
 def test_a_damaged_diagnosis_is_not_exported(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = Store(place / "results").manifests()[0].path("diagnosis.json")
     path.write_bytes(path.read_bytes()[:-40])
-    words = ["export", "field/wide", "--to", "mcap", "--file", place / "x.mcap", "--out", place / "results"]
+    words = [
+        "export",
+        "field/wide",
+        "--to",
+        "mcap",
+        "--file",
+        place / "x.mcap",
+        "--results",
+        place / "results",
+    ]
     assert slip(*words) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "has changed since it was written" in line
@@ -57,7 +66,7 @@ def test_a_copied_log_is_the_stored_run(place: Path) -> None:
     (place / "elsewhere").mkdir()
     log = shutil.copyfile(place / "field" / "wide.mcap", place / "elsewhere" / "other.mcap")
 
-    where = ("--on", log, "--out", place / "results", "--quiet")
+    where = ("--on", log, "--results", place / "results", "--quiet")
     assert slip("model", "add", place / "husky.toml", "effective_track", *where) == 0
     assert hash_tree(place / "results") == before
 
@@ -67,12 +76,12 @@ def test_a_log_that_is_not_stored_is_storeds_own_vehicle_and_only_once(
 ) -> None:
     log, model = stored_run / "field" / "wide.mcap", tmp_path / "mine.toml"
     shutil.copyfile(stored_run / "husky.toml", model)
-    assert slip("model", "fit", model, "--on", log, "--out", tmp_path / "fitted", "--quiet") == 0
+    assert slip("model", "fit", model, "--on", log, "--results", tmp_path / "fitted", "--quiet") == 0
     first = hash_tree(tmp_path / "fitted")
-    assert slip("model", "fit", model, "--on", log, "--out", tmp_path / "fitted", "--quiet") == 0
+    assert slip("model", "fit", model, "--on", log, "--results", tmp_path / "fitted", "--quiet") == 0
     assert hash_tree(tmp_path / "fitted") == first
 
-    assert slip("analyze", log, "--no-report", "--out", tmp_path / "analyzed", "--quiet") == 0
+    assert slip("analyze", log, "--no-report", "--results", tmp_path / "analyzed", "--quiet") == 0
     assert hash_tree(tmp_path / "analyzed" / "runs") == hash_tree(tmp_path / "fitted" / "runs")
 
 
@@ -87,7 +96,7 @@ def test_the_vehicle_that_is_chosen_is_the_one_that_counts(
         where = (
             "--on",
             "field/wide",
-            "--out",
+            "--results",
             place / "results",
             "--vehicle-of",
             whose,
@@ -112,12 +121,12 @@ def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
     before = hash_tree(place / "results")
     log, out = place / "field" / "wide.mcap", place / "results"
 
-    assert slip("diagnose", log, "--out", out, "--input", "measured", "--quiet") == 0
-    assert slip("diagnose", "field/wide", "--out", out, "--quiet") == 0
+    assert slip("diagnose", log, "--results", out, "--input", "measured", "--quiet") == 0
+    assert slip("diagnose", "field/wide", "--results", out, "--quiet") == 0
     capsys.readouterr()
-    assert slip("diagnose", log, "--out", out, "--vehicle", "jackal", "--json") == 0
+    assert slip("diagnose", log, "--results", out, "--vehicle", "jackal", "--json") == 0
     jackal = json.loads(capsys.readouterr().out)["runs"][0]
-    assert slip("diagnose", log, "--out", out, "--json") == 0
+    assert slip("diagnose", log, "--results", out, "--json") == 0
     husky = json.loads(capsys.readouterr().out)["runs"][0]
     # Answered with the vehicle that was asked for: wheels of another radius give another ideal motion.
     assert jackal["ladder"][0]["t_mrmse_m"] > 1.5 * husky["ladder"][0]["t_mrmse_m"]
@@ -127,7 +136,7 @@ def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
 def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, stored_run: Path) -> None:
     log = stored_run / "field" / "wide.mcap"
     for name in ("command", "measured"):
-        assert slip("diagnose", log, "--out", tmp_path / name, "--input", name, "--quiet") == 0
+        assert slip("diagnose", log, "--results", tmp_path / name, "--input", name, "--quiet") == 0
     assert hash_tree(tmp_path / "command" / "runs") == hash_tree(tmp_path / "measured" / "runs")
 
 
@@ -138,7 +147,7 @@ def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
     log = place / "field" / "wide.mcap"
     log.with_name("run.toml").write_text("[velocity]\nwindow_s = 1.0\n", encoding="utf-8")
 
-    assert slip("model", "fit", place / "husky.toml", "--on", log, "--out", place / "results") == 0
+    assert slip("model", "fit", place / "husky.toml", "--on", log, "--results", place / "results") == 0
     assert f"slip analyze {log}" in capsys.readouterr().err
     assert hash_tree(place / "results") == before
 
@@ -189,10 +198,10 @@ def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_ta
     screens, models, told = [], [], []
     for number in range(3):
         model = place / f"model_{number}.toml"
-        assert slip("diagnose", run, "--out", out, "--apply", model) == 0
+        assert slip("diagnose", run, "--results", out, "--apply", model) == 0
         screens.append(capsys.readouterr().out.replace(model.name, "model.toml"))
         models.append(model.read_bytes())
-        assert slip("diagnose", run, "--out", out, "--json") == 0
+        assert slip("diagnose", run, "--results", out, "--json") == 0
         told.append(json.loads(capsys.readouterr().out))
         if not is_stored and not number:
             # The first diagnosis has filled the columns of the model.
@@ -205,8 +214,8 @@ def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_ta
     assert told[0] == told[1] == told[2]
 
     # Another question is searched, and does not take the place of the answer.
-    assert slip("diagnose", run, "--out", out, "--input", "measured", "--budget", "60s", "--quiet") == 0
-    assert slip("diagnose", log, "--out", out, "--vehicle", "jackal", "--quiet") == 0
+    assert slip("diagnose", run, "--results", out, "--input", "measured", "--budget", "60s", "--quiet") == 0
+    assert slip("diagnose", log, "--results", out, "--vehicle", "jackal", "--quiet") == 0
     searched = len(searches)
     assert searched == (2 if is_stored else 3)
     # What is kept of other tables, or of another version, is no answer.
@@ -214,10 +223,10 @@ def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_ta
     assert len(kept) == (0 if is_stored else 1)
     for path in kept:
         path.write_text(json.dumps({**json.loads(path.read_text()), "key": "older"}))
-        assert slip("diagnose", run, "--out", out, "--quiet") == 0
+        assert slip("diagnose", run, "--results", out, "--quiet") == 0
         assert len(searches) == searched + 1
         path.write_text("{")
-        assert slip("diagnose", run, "--out", out, "--quiet") == 0
+        assert slip("diagnose", run, "--results", out, "--quiet") == 0
         assert len(searches) == searched + 2
 
 

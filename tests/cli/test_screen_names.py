@@ -45,11 +45,11 @@ def test_a_log_cannot_write_lines_of_its_own(tmp_path: Path, capsys: pytest.Capt
     log.write_text("no recording\n" * 5)
     out = tmp_path / "out"
     with pytest.raises(SystemExit):
-        main(["batch", str(log), "--out", str(out), "--executor", "inline", "--settle", "0"])
+        main(["batch", str(log), "--results", str(out), "--executor", "inline", "--settle", "0"])
     with pytest.raises(SystemExit):
         main(["results", "status", str(out)])
     with pytest.raises(SystemExit):
-        main(["analyze", str(log), "--out", str(out)])
+        main(["analyze", str(log), "--results", str(out)])
     text = "".join(capsys.readouterr())
     assert "\x1b" not in text
     assert "all is well" in text

@@ -23,7 +23,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) -> None:
     done = run_verb(
-        "analyze", field / "truncated.mcap", "--out", tmp_path, "--json", "--no-report", "--no-diagnosis"
+        "analyze", field / "truncated.mcap", "--results", tmp_path, "--json", "--no-report", "--no-diagnosis"
     )
 
     assert done.returncode == 3
@@ -35,7 +35,13 @@ def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) 
 
 def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tmp_path: Path) -> None:
     done = run_program(
-        "analyze", field / "good.mcap", field / "missing.mcap", "--out", tmp_path, "--json", "--no-diagnosis"
+        "analyze",
+        field / "good.mcap",
+        field / "missing.mcap",
+        "--results",
+        tmp_path,
+        "--json",
+        "--no-diagnosis",
     )
 
     assert done.returncode == 1, "one of two failed"
@@ -57,7 +63,7 @@ def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tm
 
 
 def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
-    done = run_program("results", "stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
+    done = run_program("results", "stage", "extract", field / "good.mcap", "--results", tmp_path, "--json")
     assert done.returncode == 0
     assert set(json.loads(done.stdout)["rows"]) == {
         "alignments",
@@ -68,14 +74,14 @@ def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
         "findings",
     }
 
-    by_run = run_verb("results", "stage", "slip", "good", "--out", tmp_path, "--json")
+    by_run = run_verb("results", "stage", "slip", "good", "--results", tmp_path, "--json")
     assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]
 
 
 def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None:
     out = tmp_path / "sim.mcap"
     done = run_program(
-        "simulate", "ideal_husky", "--effect", "effective_track=1.8", "--duration", 20, "--out", out
+        "simulate", "ideal_husky", "--effect", "effective_track=1.8", "--duration", 20, "--file", out
     )
     assert done.returncode == 0, done.stderr
     assert out.is_file()
@@ -83,7 +89,7 @@ def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None
     twice = ["drive_lag=tau:1,tau:2"], ["drive_lag=0.3", "drive_lag=0.5"]
     for effects in (["effective_track=wide"], ["antigravity=1"], *twice):
         asked = [word for effect in effects for word in ("--effect", effect)]
-        wrong = run_verb("simulate", "ideal_husky", *asked, "--out", tmp_path / "x.mcap")
+        wrong = run_verb("simulate", "ideal_husky", *asked, "--file", tmp_path / "x.mcap")
         assert wrong.returncode == 1
         assert len(wrong.stderr.splitlines()) == 1
         assert not (tmp_path / "x.mcap").exists()

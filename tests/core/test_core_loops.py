@@ -57,7 +57,14 @@ def test_what_set_up_compiles_is_what_a_diagnosis_calls(samples: Path, tmp_path:
     compiled = _list_cached(cache)
     assert len(compiled) > 10
     _run(
-        cache, "-m", "pipeline", "diagnose", samples / "husky_tile.mcap", "--out", tmp_path / "out", "--quiet"
+        cache,
+        "-m",
+        "pipeline",
+        "diagnose",
+        samples / "husky_tile.mcap",
+        "--results",
+        tmp_path / "out",
+        "--quiet",
     )
     assert _list_cached(cache) == compiled
 

@@ -66,7 +66,7 @@ def test_late_poses_that_a_gyro_dated_are_judged_with_the_clock_once(tmp_path: P
     late = tmp_path / "late.toml"
     clock = find_effect("clock_offset")(d=_LATE_S)
     write_model(ModelFile(Model(forecast.vehicle, (*forecast.effects, clock))), late)
-    compared = _answer("model", ["compare", expected, late], "--on", another, "--out", tmp_path / "other")
+    compared = _answer("model", ["compare", expected, late], "--on", another, "--results", tmp_path / "other")
     one, two = (row["carried"]["t_mrmse_m"] for row in compared["compared"])
     assert two == one
     assert one < 1.2 * compared["compared"][0]["own_fit"]["t_mrmse_m"]

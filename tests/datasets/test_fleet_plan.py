@@ -66,7 +66,7 @@ def test_a_plan_for_a_terrain_needs_no_run(
 ) -> None:
     told = ["plan", "--vehicle", "warthog", "--terrain", "gravel", "--results", str(results), "--json"]
     with pytest.raises(SystemExit, match="0"):
-        main([*told, "--for", "effective_track", "--out", str(tmp_path / "plan")])
+        main([*told, "--for", "effective_track", "--folder", str(tmp_path / "plan")])
     made = json.loads(capsys.readouterr().out)
     assert made["known"] == {"terrain": "gravel", "runs_on_terrain": 3, "runs_elsewhere": 3}
     (answer,) = made["promises"]

@@ -25,6 +25,7 @@ KEYS = [
 ASKED = {
     "analyze": ("field/wide.mcap",),
     "diagnose": ("field/wide",),
+    "watch": ("field/wide.mcap",),
     "inspect": ("field/wide.mcap",),
     "model fit": ("husky.toml", "--on", "field/wide"),
     "model speed": ("husky.toml", "--on", "field/wide", "--within", "10cm"),

@@ -39,6 +39,6 @@ def test_no_screen_has_a_barrier_an_error_or_is_wider_than_its_window(pictures: 
     findings = take_all(pictures / "screens")
     states = {one.screen for one in findings}
     assert len([name for name in states if name.startswith("workbench")]) == 12
-    assert {"plan", "check", "watch_live", "page_fleet", "page_comparison"} <= states
+    assert {"plan", "check", "page_fleet", "page_comparison"} <= states
     assert len(findings) == len(states) * len(LOOKS)
     assert [one for one in findings if not one.is_sound] == [], format_table(findings)

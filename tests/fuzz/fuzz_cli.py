@@ -177,9 +177,9 @@ def make_seeds(folder: Path) -> None:
         )
 
     folder.mkdir(parents=True, exist_ok=True)
-    run("simulate", "husky_tile", "--out", "log.mcap", "--duration", "12", "--seed", "1")
-    run("analyze", "log.mcap", "--no-diagnosis", "--out", "results")
-    run("batch", "log.mcap", "--out", "results", "--executor", "inline")
+    run("simulate", "husky_tile", "--file", "log.mcap", "--duration", "12", "--seed", "1")
+    run("analyze", "log.mcap", "--no-diagnosis", "--results", "results")
+    run("batch", "log.mcap", "--results", "results", "--executor", "inline")
     run("model", "new", "model.toml", "--vehicle", "husky_a200")
     run(
         "model",
@@ -191,7 +191,7 @@ def make_seeds(folder: Path) -> None:
         "log.mcap",
         "--anyway",
         "--quiet",
-        "--out",
+        "--results",
         "results",
     )
     with (folder / "model.toml").open("a") as model:
@@ -256,9 +256,9 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
     analyze = ["--no-report", *(["--no-diagnosis"] if rng.random() < 0.9 else [])]
     on_log = [
         ["inspect", "log.mcap"],
-        ["analyze", "log.mcap", *analyze, "--out", "out"],
-        ["batch", "log.mcap", "--executor", "inline", "--settle", "0", "--out", "out"],
-        ["results", "stage", "extract", "log.mcap", "--out", "out"],
+        ["analyze", "log.mcap", *analyze, "--results", "out"],
+        ["batch", "log.mcap", "--executor", "inline", "--settle", "0", "--results", "out"],
+        ["results", "stage", "extract", "log.mcap", "--results", "out"],
     ]
     if kind == "model":
         target, verbs = (
@@ -266,7 +266,7 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
             [
                 ["model", "show", "model.toml"],
                 ["model", "export", "model.toml", "--to", rng.choice(TARGETS)],
-                ["analyze", "log.mcap", *analyze, "--model", "model.toml", "--out", "out"],
+                ["analyze", "log.mcap", *analyze, "--model", "model.toml", "--results", "out"],
             ],
         )
     elif kind == "results":
@@ -281,33 +281,33 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
         verbs = [
             ["results", "status", "results"],
             ["results", "verify", "results"],
-            ["results", "query", rng.choice(QUERIES), "--out", "results"],
-            ["results", "explain", str(run), "--out", "results"],
+            ["results", "query", rng.choice(QUERIES), "--results", "results"],
+            ["results", "explain", str(run), "--results", "results"],
             [
                 "export",
                 str(run),
                 "--to",
                 rng.choice(("mcap", "csv")),
-                "--out",
+                "--results",
                 "results",
                 "--file",
                 "out/x.mcap",
             ],
-            ["batch", "log.mcap", "--executor", "inline", "--settle", "0", "--out", "results"],
-            ["analyze", "log.mcap", *analyze, "--out", "results"],
-            ["diagnose", str(run), "--out", "results"],
+            ["batch", "log.mcap", "--executor", "inline", "--settle", "0", "--results", "results"],
+            ["analyze", "log.mcap", *analyze, "--results", "results"],
+            ["diagnose", str(run), "--results", "results"],
         ]
     elif kind == "bag":
         target, verbs = (
             folder / "bag" / "metadata.yaml",
             [
                 ["inspect", "bag"],
-                ["batch", "bag", "--executor", "inline", "--settle", "0", "--out", "out"],
+                ["batch", "bag", "--executor", "inline", "--settle", "0", "--results", "out"],
             ],
         )
     elif kind == "sql":
         sql = damage_text(rng.choice(QUERIES), rng).replace("\x00", "")
-        return Case(folder, ["results", "query", "--out", "results", *json_too, "--", sql], "sql")
+        return Case(folder, ["results", "query", "--results", "results", *json_too, "--", sql], "sql")
     else:
         target, verbs = folder / {"log": "log.mcap", "run": "run.toml", "fleet": "fleet.toml"}[kind], on_log
     damage_file(target, rng)

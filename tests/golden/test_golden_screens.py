@@ -71,7 +71,6 @@ READING = {
     "help.txt": [("--help",), ("help", "model", "add"), ("help", "fleet"), ("help", "results")],
     "usage.txt": [
         ("fly",),
-        ("status",),
         ("analyze",),
         ("analyze", "log.mcap", "--input", "guess"),
         ("model", "add", "robot.toml", "drive_lag"),

@@ -102,14 +102,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fleet")
     for number, k in enumerate((1.74, 1.8, 1.86, 1.8)):
         log = folder / f"run_{number}.mcap"
-        for arguments in (
-            ["simulate", "--effect", f"effective_track={k}", "--seed", str(number), "--duration", "40"],
-            ["analyze", str(log), "--terrain", "tile", "--no-report", "--quiet", "--input", "measured"],
-        ):
-            if arguments[0] == "analyze" and number == 3:
-                continue
-            out = log if arguments[0] == "simulate" else folder / "results"
-            run_verb(*arguments, "--out", out)
+        drive = ("--effect", f"effective_track={k}", "--seed", number, "--duration", 40)
+        run_verb("simulate", *drive, "--file", log)
+        if number < 3:
+            told = ("--terrain", "tile", "--no-report", "--quiet", "--input", "measured")
+            run_verb("analyze", log, *told, "--results", folder / "results")
     return folder
 
 
@@ -117,7 +114,7 @@ def test_a_few_seconds_are_fitted_with_the_fleet_before(
     fleet: Path,
 ) -> None:
     log, file = fleet / "run_3.mcap", fleet / "few.toml"
-    on = ("--on", str(log), "--out", str(fleet / "results"), "--input", "measured", "--json")
+    on = ("--on", str(log), "--results", str(fleet / "results"), "--input", "measured", "--json")
     code, out, error = run_slip("model", "fit", str(file), *on, "--first", "6s", "--prior", "fleet")
     assert code == 0, error
     told = json.loads(out)

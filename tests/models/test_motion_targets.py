@@ -304,7 +304,7 @@ def test_the_verb_writes_the_file_or_nothing(tmp_path: Path) -> None:
     )
     out = tmp_path / "p.yaml"
     export = ("model", "export", model, "--to")
-    assert run_verb(*export, "ros2_control", "--out", out).returncode == 0
+    assert run_verb(*export, "ros2_control", "--file", out).returncode == 0
     assert "wheel_separation_multiplier: 1.8" in out.read_text(encoding="utf-8")
-    done = run_verb(*export, "px4", "--out", tmp_path / "no" / "p")
+    done = run_verb(*export, "px4", "--file", tmp_path / "no" / "p")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)

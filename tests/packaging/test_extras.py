@@ -17,7 +17,7 @@ from pipeline.store import Store
 
 ROOT = Path(__file__).parents[2]
 EXTRAS = ("distributed", "llvmlite", "mujoco", "numba", "pandas", "s3fs", "sklearn", "starlette", "uvicorn",
-          "vl_convert", "websockets")  # fmt: skip
+          "vl_convert")  # fmt: skip
 LEAN = f"""
 import sys
 

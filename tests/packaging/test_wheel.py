@@ -51,7 +51,7 @@ def use_it(program: Path, wheel: Path, tmp_path: Path) -> None:
     """A sample is analyzed, and its results are served to who has the token."""
     log = ROOT / "data_samples" / "husky_tile.mcap"
     done = subprocess.run(
-        [str(program), "analyze", str(log), "--out", "out"],
+        [str(program), "analyze", str(log), "--results", "out"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -164,7 +164,7 @@ def _run(*arguments: str | Path, code: int = 0) -> str:
 
 @pytest.mark.long
 def test_a_plan_for_nothing_says_what_it_needs(tmp_path: Path) -> None:
-    assert "--vehicle" in _run("plan", "--out", tmp_path / "plan", code=1)
+    assert "--vehicle" in _run("plan", "--folder", tmp_path / "plan", code=1)
     assert "this is not a plan" not in _run("plan", "--check", tmp_path / "gone", "x.mcap", code=1)
     (tmp_path / "plan.toml").write_text("vehicle = 3\n", encoding="utf-8")
     assert "this is not a plan" in _run("plan", "--check", tmp_path / "plan.toml", "x.mcap", code=1)
@@ -181,9 +181,9 @@ def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None
     ]
     before, after, folder = tmp_path / "circle.mcap", tmp_path / "drive.mcap", tmp_path / "plan"
     _run(
-        "simulate", *hidden, "--program", "circle", "--vehicle", "husky", "--duration", "40", "--out", before
+        "simulate", *hidden, "--program", "circle", "--vehicle", "husky", "--duration", "40", "--file", before
     )
-    made = json.loads(_run("plan", before, "--results", tmp_path / "results", "--out", folder, "--json"))
+    made = json.loads(_run("plan", before, "--results", tmp_path / "results", "--folder", folder, "--json"))
     pairs = [one for one in made["promises"] if "expected_t" in one]
     assert any("icr_offset" in one["effects"] for one in pairs)
     assert made["topic"] == "/controller/cmd_vel"
@@ -197,7 +197,7 @@ def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None
         "5",
         "--play",
         folder / "plan.mcap",
-        "--out",
+        "--file",
         after,
     )
     checked = json.loads(_run("plan", "--check", folder, after, "--results", tmp_path / "results", "--json"))

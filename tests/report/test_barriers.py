@@ -48,7 +48,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         analyze_log(log, Options(out=results, diagnosis=number == 0, overrides={"run": {"terrain": terrain}}))
     for verb in ("compare", "fleet trend", "fleet map"):
         print_verb(*verb.split(), results, "--quiet")
-    print_verb("plan", "--vehicle", "husky_a200", "--time", "120s", "--out", folder / "plan", "--quiet")
+    print_verb("plan", "--vehicle", "husky_a200", "--time", "120s", "--folder", folder / "plan", "--quiet")
     write_page(Store(results), CATALOGUE, render_catalogue(Store(results)))
     return {
         "report": next(results.glob("runs/*/tile_0/*/report.html")),

@@ -21,7 +21,6 @@ SteeringGain = declare(
         least=Least(0.01, Least.DATA_SHEET),
         plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),
         quantities=(Quantity.STEERING_GAIN,),
-        learned_within=Plausible(0.5, 2.0, "openpilot's paramsd: half to twice the nominal steering ratio"),
     ),
     rank=50,
     kinds=ACKERMANN,

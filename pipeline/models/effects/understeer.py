@@ -19,11 +19,6 @@ Understeer = declare(
         "understeer gradient",
         0.03,
         plausible=Plausible(-0.02, 0.5, "wider than the 0.03 of a road car"),
-        learned_within=Plausible(
-            -0.02,
-            0.15,
-            "openpilot's paramsd: tyres of a fifth of their stiffness, on a road car of 0.03 s^2/m",
-        ),
     ),
     rank=40,
     kinds=ACKERMANN,

@@ -12,8 +12,7 @@ ARGUMENTS = {
     "folder": (None, "folder that the recorder writes to, or one MCAP file"),
     "results": ("results", "folder of results"),
     "vehicle": ("", "preset of the vehicle; empty for the robot description of the recording"),
-    "quiet_s": ("30", "seconds without new data after which the watch ends with the diagnosis"),
-    "page": ("", "page that reloads itself in a browser; empty for none"),
+    "quiet_s": ("30", "seconds without new data after which the watch ends"),
 }
 """Arguments of the launch file, by name: default and description."""
 
@@ -22,7 +21,7 @@ def start_watch(context: LaunchContext) -> list[ExecuteProcess]:
     """The process that watches, with the options that are not empty."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     command = [sys.executable, "-m", "pipeline", "watch", given["folder"], "--results", given["results"]]
-    options = {"--for": given["quiet_s"], "--vehicle": given["vehicle"], "--page": given["page"]}
+    options = {"--for": given["quiet_s"], "--vehicle": given["vehicle"]}
     for option, value in options.items():
         command += [option, value] if value else []
     return [ExecuteProcess(cmd=command, name="slip_watch", output="screen")]
