@@ -391,6 +391,8 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
             count = known.message_count + part.catalog.counts.get(number, 0)
             channels[key] = replace(known, message_count=count)
             part.numbers[number] = known.id
+    end_ns = max((each.end_ns for each in catalogs if each.end_ns is not None), default=0)
+    unset = ("the recorder's clock is not set: it shows times after the year 2116",)
     return LogIndex(
         path=path,
         size_bytes=sum(part.size_bytes for part in parts),
@@ -399,12 +401,12 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
         compressions=tuple(sorted(set().union(*(catalog.compressions for catalog in catalogs)))),
         chunk_count=sum(catalog.count_chunks() for catalog in catalogs),
         start_ns=min((each.start_ns for each in catalogs if each.start_ns is not None), default=0),
-        end_ns=max((each.end_ns for each in catalogs if each.end_ns is not None), default=0),
+        end_ns=end_ns,
         channels=tuple(channels.values()),
         metadata=dict(record for catalog in catalogs for record in catalog.metadata),
         attachments=tuple(name for catalog in catalogs for name in catalog.attachments),
         losses=(*losses, *(loss for catalog in catalogs for loss in catalog.losses)),
-        notes=tuple(note for catalog in catalogs for note in catalog.notes),
+        notes=(*(note for catalog in catalogs for note in catalog.notes), *unset * (end_ns >= rec.LATEST_NS)),
         parts=tuple(parts),
         fetched_bytes=fetched,
     )

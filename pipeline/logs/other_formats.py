@@ -49,8 +49,6 @@ _REPAIRS: Final = {rec.ROS1_BAG: "`rosbag reindex`", rec.SQLITE_BAG: "`sqlite3 F
 _TOGETHER: Final = 4 << 20
 """Size of the payloads that are passed on together [bytes]."""
 
-_LAST_TIME: Final = (1 << 63) - 1
-
 
 def catalog_other(source: ByteSource, container: str, max_inflated: int | None) -> Catalog | None:
     """Catalog the contents of a bag or a text table; None for any other file.
@@ -82,8 +80,8 @@ def _catalog_bag(source: ByteSource, container: str) -> Catalog:
             _note_connection(connection, catalog)
         metadata: Any = getattr(reader, "metadata", reader)
         if any(catalog.counts.values()):
-            catalog.start_ns = max(0, int(metadata.start_time))
-            catalog.end_ns = min(_LAST_TIME, int(metadata.end_time) - 1)
+            catalog.start_ns = rec.clip_time(int(metadata.start_time))
+            catalog.end_ns = rec.clip_time(int(metadata.end_time) - 1)
         chunks: Mapping[int, Any] = getattr(reader, "chunks", {})
         catalog.bag_chunks = len(chunks)
         catalog.compressions = {_name_compression(chunk) for chunk in chunks.values()}
@@ -137,8 +135,11 @@ def read_other(
 def _read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -> Iterator[Held]:
     """Read the messages of a bag, a few megabytes at a time."""
     allowance = Allowance(most, most)
-    collected = _Collected(allowance)
     with _open(path, container, allowance) as reader:
+        about: Any = getattr(reader, "metadata", reader)
+        # A clock that is not set shows no time at all; a time of a few messages is damaged.
+        unset = int(about.start_time) > rec.LATEST_NS or int(about.end_time) <= 0
+        collected = _Collected(allowance, unset)
         wanted = [connection for connection in reader.connections if connection.id in numbers]
         if not wanted:
             return
@@ -162,9 +163,10 @@ def _read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) 
 
 @dataclass(slots=True)
 class _Collected:
-    """Messages that are not yet passed on."""
+    """Messages that are not yet passed on, and whether the clock of the recorder was not set."""
 
     allowance: Allowance
+    unset: bool
     size: int = 0
     count: int = 0
     odd: int = 0
@@ -173,7 +175,8 @@ class _Collected:
     messages: dict[int, tuple[list[int], list[Buffer]]] = field(default_factory=dict)
 
     def add(self, number: int, time: object, data: object) -> None:
-        if not isinstance(time, int) or not 0 <= time <= _LAST_TIME or not isinstance(data, bytes):
+        is_time = isinstance(time, int) and (self.unset or 0 <= time <= rec.LATEST_NS)
+        if not is_time or not isinstance(data, bytes):
             self.odd += 1
             return
         try:
@@ -184,11 +187,11 @@ class _Collected:
         if payload is not data:
             self.allowance.take(len(payload))
         times, payloads = self.messages.setdefault(number, ([], []))
-        times.append(time)
+        times.append(rec.clip_time(time))
         payloads.append(payload)
         self.size += len(payload)
         self.count += 1
-        self.last = time
+        self.last = times[-1]
 
     def take(self) -> dict[int, Payloads]:
         taken = {
@@ -295,9 +298,6 @@ _MAX_LINES: Final = 12_000_000
 
 _KEPT_NS: Final = 1_000
 """Resolution of times [ns]: a double resolves seconds since 1970 to about one microsecond."""
-
-_LATEST_NS: Final = float(1 << 62)
-"""Upper limit of valid times [ns], in the year 2116."""
 
 _CHANNEL: Final = 1
 """Channel number of a table, which has only one channel."""
@@ -473,7 +473,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
     values = _parse_lines(lines, separator, places)
     with np.errstate(invalid="ignore"):
         at = np.rint(values[:, 0] * (table.tick_ns / _KEPT_NS))
-        good = (at >= 0.0) & (at < _LATEST_NS / _KEPT_NS)
+        good = (at >= 0.0) & (at < rec.LATEST_NS / _KEPT_NS)
     if not (good.all() and len(lines) == at.size):
         count = len(lines) - int(good.sum())
         losses.append(Loss("damaged_record", f"{count} lines of {table.path} cannot be read"))
