@@ -117,7 +117,7 @@ def read_limits(path: Path) -> Limits:
     limits = convert_to(Limits, tree)
     if isinstance(limits, Fault):
         what = f"the limits are not valid: {limits.what}"
-        raise ComparisonError("bad_limits", what, where=str(path), hint=limits.hint)
+        raise ComparisonError("bad_limits", what, where=str(path), hint=limits.hint or _HINT)
     for name, bound in _list_bounds(limits):
         _require_sense(path, name, bound)
     if not any(True for _ in _list_bounds(limits)):

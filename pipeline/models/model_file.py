@@ -317,7 +317,8 @@ class _Reader:
         section = convert_to(_VehicleTable, table)
         if isinstance(section, Fault):
             what, key = f"the vehicle is not valid: {section.what}", "".join(section.steps[:1])
-            raise self._error(what, section.hint, ("vehicle", 0), key, code="vehicle_invalid")
+            hint = section.hint or "The handbook, Configuration, lists the keys."
+            raise self._error(what, hint, ("vehicle", 0), key, code="vehicle_invalid")
         try:
             return resolve_vehicle(section, recorded=None, where=str(self.path))
         except ConfigurationError as error:

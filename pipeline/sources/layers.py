@@ -34,7 +34,7 @@ class Fault(NamedTuple):
 
     Attributes:
         what: what is wrong, one line without a full stop.
-        hint: what to do about it.
+        hint: what to do about it; empty if that is not known.
         steps: names of the keys that lead to it.
         value: the refused word; empty if it is a number.
     """
@@ -67,11 +67,11 @@ def convert_to(kind: type[Section], tree: Tree) -> Section | Fault:
     steps = _STEP.findall(key_path)
     if unknown:
         keys = ", ".join(sorted(_list_keys(kind, steps)))
-        hint = f"The keys there are: {keys}." if keys else "The handbook, Configuration, lists the keys."
+        hint = f"The keys there are: {keys}." if keys else ""
         steps.append(unknown)
     else:
         words = ", ".join(str(word) for word in _list_words(kind, steps))
-        hint = f"Write one of: {words}." if words else "The handbook, Configuration, lists keys and units."
+        hint = f"Write one of: {words}." if words else ""
     return Fault(shorten(_readable(message)), hint, [step for step in steps if step != "["], value)
 
 
@@ -135,6 +135,8 @@ def _walk(kind: type[msgspec.Struct], steps: Iterable[str]) -> Iterator[msgspec.
         for one in _spread(kinds):
             if step == "[" and isinstance(one, msgspec.inspect.ListType | msgspec.inspect.VarTupleType):
                 inner.append(one.item_type)
+            elif step == "[" and isinstance(one, msgspec.inspect.DictType):
+                inner.append(one.value_type)
             elif isinstance(one, msgspec.inspect.StructType):
                 inner += [field.type for field in one.fields if field.encode_name == step]
         kinds = inner
@@ -318,7 +320,8 @@ def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configurat
     if isinstance(found, Fault):
         what, place = f"the configuration is not valid: {found.what}", found.steps
         where = _name_line(where, source, place, found.value)
-        raise ConfigurationError("config_invalid", what, where=where, hint=found.hint)
+        hint = found.hint or "The handbook, Configuration, lists keys and units."
+        raise ConfigurationError("config_invalid", what, where=where, hint=hint)
     return found
 
 
