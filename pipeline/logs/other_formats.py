@@ -175,8 +175,10 @@ class _Collected:
     messages: dict[int, tuple[list[int], list[Buffer]]] = field(default_factory=dict)
 
     def add(self, number: int, time: object, data: object) -> None:
-        is_time = isinstance(time, int) and (self.unset or 0 <= time <= rec.LATEST_NS)
-        if not is_time or not isinstance(data, bytes):
+        if not isinstance(time, int) or not isinstance(data, bytes):
+            self.odd += 1
+            return
+        if not self.unset and time != rec.clip_time(time):
             self.odd += 1
             return
         try:

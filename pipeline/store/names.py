@@ -99,7 +99,7 @@ def name_disk_errors(path: Path) -> Iterator[None]:
         yield
     except TooLargeError as error:
         hint = "It is not read: look at who wrote it, and remove it"
-        raise StoreError("too_large", error.strerror, where=str(error.filename), hint=hint) from error
+        raise StoreError("too_large", str(error.strerror), where=str(error.filename), hint=hint) from error
     except OSError as error:
         code, what = "disk_error", f"the system reports: {error.strerror or error}"
         hint = "Check the disk and run the same command again; what was there before is untouched"
