@@ -119,14 +119,14 @@ class _StoredNumber(msgspec.Struct):
     name: str
     because: str
     value: float
-    unit: str | None = None
-    level: str | None = None
-    low: float | None = None
-    high: float | None = None
-    spread_terrain: float | None = None
-    spread_run: float | None = None
-    chi_square: float | None = None
-    terrains: dict[str, _StoredMean] | None = None
+    unit: str | None
+    level: str | None
+    low: float | None
+    high: float | None
+    spread_terrain: float | None
+    spread_run: float | None
+    chi_square: float | None
+    terrains: dict[str, _StoredMean] | None
 
 
 class _StoredFleet(msgspec.Struct):

@@ -91,11 +91,11 @@ class _Finding(msgspec.Struct):
     id: str
     text: str
     severity: Literal["info", "warning", "error"]
-    where: str | None = None
-    t_start: Number = None
-    t_end: Number = None
-    value: Number = None
-    count: int | None = None
+    where: str | None
+    t_start: Number
+    t_end: Number
+    value: Number
+    count: int | None
 
 
 class _Source(msgspec.Struct):

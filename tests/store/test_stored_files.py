@@ -22,7 +22,7 @@ VERBS = {
         f"diagnose {RUN}",
         f"diagnose {RUN} --all",
         f"results explain {RUN} effective_track.k",
-        f"export {RUN} --to foxglove --file x.mcap",
+        f"export {RUN} --to foxglove-layout --file x.json",
     ],
 }
 ODD = st.sampled_from([None, True, 0, -1.5, 1e300, "", "another", [], {}, [[]], {"a": None}, ["x"], [None]])
@@ -150,7 +150,7 @@ FLEET = {
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from(list(list_places(FLEET))), ODD, st.booleans())
+@given(place=st.sampled_from(list(list_places(FLEET))), odd=ODD, drop=st.booleans())
 def test_a_fleet_model_with_other_words(folder: Path, place: Path_, odd: object, *, drop: bool) -> None:
     (folder / "results" / "fleet.json").write_text(json.dumps(change(FLEET, place, odd, drop=drop)))
     for verb in ("fleet show", "fleet show --all"):
