@@ -616,7 +616,7 @@ def read_result(content: Mapping[str, object], kind: type[Result], where: Path =
     Raises:
         StoreError: ``file_damaged``, a key has another type.
     """
-    return convert_stored(_fill(content), kind, where)
+    return convert_stored(_fill(content), kind, where, strict=False)
 
 
 def _fill(value: object, key: str = "") -> object:

@@ -42,14 +42,23 @@ def decode_stored(data: bytes, kind: type[Kind], path: Path, *, hint: str = AGAI
         raise _damaged(error, path, hint) from error
 
 
-def convert_stored(content: object, kind: type[Kind], path: Path, *, hint: str = AGAIN) -> Kind:
-    """An object of such a file as a type; words and numbers may be of an earlier version's types.
+def convert_stored(
+    content: object, kind: type[Kind], path: Path, *, hint: str = AGAIN, strict: bool = True
+) -> Kind:
+    """An object of such a file as a type.
+
+    Args:
+        content: the object.
+        kind: the type.
+        path: the file.
+        hint: how to make the file again.
+        strict: whether a text or a truth value is no number.
 
     Raises:
         StoreError: ``file_damaged``.
     """
     try:
-        return msgspec.convert(content, kind, strict=False)
+        return msgspec.convert(content, kind, strict=strict)
     except (msgspec.ValidationError, RecursionError) as error:
         raise _damaged(error, path, hint) from error
 
