@@ -464,8 +464,8 @@ def resolve_vehicle(
 def list_ranges(kind: type[msgspec.Struct]) -> dict[str, tuple[float, float]]:
     """Smallest and largest allowed value of the numbers of a section, by key."""
     fields = msgspec.inspect.type_info(kind).fields  # type: ignore[attr-defined]
-    found = {field.encode_name: list_bounds(field.type) for field in fields}
-    return {key: bounds for key, bounds in found.items() if bounds is not None}
+    ranges = {field.encode_name: list_bounds(field.type) for field in fields}
+    return {key: bounds for key, bounds in ranges.items() if bounds is not None}
 
 
 def list_bounds(kind: msgspec.inspect.Type) -> tuple[float, float] | None:

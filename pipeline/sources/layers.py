@@ -316,13 +316,13 @@ def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configurat
     Raises:
         ConfigurationError: unknown key or wrong value, with its location.
     """
-    found = convert_to(Configuration, tree)
-    if isinstance(found, Fault):
-        what, place = f"the configuration is not valid: {found.what}", found.steps
-        where = _name_line(where, source, place, found.value)
-        hint = found.hint or "The handbook, Configuration, lists keys and units."
+    content = convert_to(Configuration, tree)
+    if isinstance(content, Fault):
+        what = f"the configuration is not valid: {content.what}"
+        where = _name_line(where, source, content.steps, content.value)
+        hint = content.hint or "The handbook, Configuration, lists keys and units."
         raise ConfigurationError("config_invalid", what, where=where, hint=hint)
-    return found
+    return content
 
 
 def read_toml(path: Path) -> dict[str, object]:
