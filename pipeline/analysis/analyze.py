@@ -21,6 +21,7 @@ from pipeline.core import (
     PACKAGE,
     FigureFormat,
     SlipError,
+    mapping_in,
     read_version,
     require_compiler,
     require_package,
@@ -28,7 +29,7 @@ from pipeline.core import (
 from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
 from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.recording.log_setup import LogSetup, set_up_log
-from pipeline.results import RunDiagnosis, find_refusal, read_findings
+from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_result
 from pipeline.store import (
     DIAGNOSIS,
     JSON,
@@ -284,6 +285,7 @@ def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
     if SUMMARY not in manifest.files or options.through != STAGES[-1]:
         return {}
     summary = manifest.read_json(SUMMARY)
+    read_result(mapping_in(summary, "diagnosis"), RunDiagnosis, manifest.path(SUMMARY))
     has_report = REPORT in manifest.files
     summary["report"] = str(manifest.path(REPORT)) if has_report else None
     return summary

@@ -76,7 +76,7 @@ def diagnose_work(work: Work) -> RunDiagnosis | None:
         for table in DIAGNOSED:
             if table in previous.tables:
                 generation.reuse_table(table)
-        diagnosis = read_result(previous.read_json(DIAGNOSIS), RunDiagnosis)
+        diagnosis = read_result(previous.read_json(DIAGNOSIS), RunDiagnosis, previous.path(DIAGNOSIS))
     else:
         if work.options.diagnosis:
             work.progress(STAGE)

@@ -207,7 +207,7 @@ class Run(StoredRun):
     def figures(self, *, model: Model | None = None) -> dict[str, ShownFigure]:
         """The figures of its report by id; with a model, those of the model and of the data."""
         if model is None:
-            return self._draw(read_result(mapping_in(self.summary, "diagnosis"), RunDiagnosis))
+            return self._draw(self._read_diagnosis())
         take_file(model)
         return self._draw(RunDiagnosis(), model.view(self))
 
@@ -278,6 +278,10 @@ class Run(StoredRun):
                 for rival in contest.rivals
             ]
         )
+
+    def _read_diagnosis(self) -> RunDiagnosis:
+        content = mapping_in(self.summary, "diagnosis")
+        return read_result(content, RunDiagnosis, self.manifest.path(SUMMARY))
 
     def _draw(self, diagnosis: RunDiagnosis, motion: MotionView | None = None) -> dict[str, ShownFigure]:
         tables = {name: self.manifest.read(name) for name in self.tables}

@@ -217,8 +217,9 @@ def _format_loss(loss: Mapping[str, object]) -> str:
 
 
 def _format_gaps(gaps: Mapping[str, object]) -> str:
-    count = cast("int", gaps["count"])
-    return f", {count} gap{'s' if count != 1 else ''} in the poses (longest {gaps['value']:.2g} s)"
+    count, longest = cast("int", gaps["count"]), number_in(gaps, "value")
+    how_long = "" if longest is None else f" (longest {longest:.2g} s)"
+    return f", {count} gap{'s' if count != 1 else ''} in the poses{how_long}"
 
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:

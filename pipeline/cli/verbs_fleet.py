@@ -290,7 +290,7 @@ def _format_number(row: Mapping[str, object], width: int, *, everything: bool) -
     if row["level"] == "terrain" and len(terrains) > 1 and not everything:
         means = (f"{name} {format_digits(of['value'])}" for name, of in sorted(terrains.items()))
         value = f"{', '.join(means)}{unit}"
-    elif row["low"] is not None:
+    elif None not in {row["low"], row["high"]}:
         middle, low, high = (float(str(row[key])) for key in ("value", "low", "high"))
         value = format_interval(middle, low, high, row["unit"])
     numbers = ", ".join([value, *spreads])

@@ -127,9 +127,9 @@ if TYPE_CHECKING:
     )
     from pipeline.core.untrusted import (
         MOST_BYTES,
-        TOO_LARGE,
         PathError,
         TomlError,
+        TooLargeError,
         format_csv,
         mapping_in,
         may_lead_out,
@@ -142,7 +142,6 @@ if TYPE_CHECKING:
         read_object,
         require_finite,
         resolve_inside,
-        too_large,
         walk_files,
         walk_tree,
     )

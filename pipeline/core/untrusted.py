@@ -283,19 +283,30 @@ def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirE
 MOST_BYTES: Final = 32 * 2**20
 """Maximum size of a note, manifest, settings file or page that is read whole [bytes]: twenty times a report.
 Parsed, a JSON text takes up to twenty times as much memory."""
-TOO_LARGE: Final = f"it has more than {MOST_BYTES // 2**20} MB, more than any such file that slip writes"
+
+
+class TooLargeError(OSError):
+    """A file that is larger than `MOST_BYTES`, and is not read.
+
+    Args:
+        path: the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        what = f"it has more than {MOST_BYTES // 2**20} MB, more than any such file that slip writes"
+        super().__init__(errno.EFBIG, what, str(path))
 
 
 def read_bounded(path: Path) -> bytes:
     """The content of a file that is small unless somebody tampered with it.
 
     Raises:
-        OSError: it cannot be read; ``EFBIG``, it is larger than `MOST_BYTES`, and is not read whole.
+        OSError: it cannot be read; `TooLargeError`, it is larger than `MOST_BYTES`, and is not read whole.
     """
     with path.open("rb") as file:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
-        raise too_large(path)
+        raise TooLargeError(path)
     return content
 
 
@@ -307,11 +318,6 @@ def read_bounded_text(path: Path) -> str:
         UnicodeDecodeError: it is not UTF-8.
     """
     return read_bounded(path).decode()
-
-
-def too_large(path: Path) -> OSError:
-    """The error for a file that is larger than `MOST_BYTES`."""
-    return OSError(errno.EFBIG, TOO_LARGE, str(path))
 
 
 def read_object(path: Path) -> dict[str, object]:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -20,7 +20,6 @@ from pipeline.core import (
     parse_toml,
     read_bounded_text,
     require_finite,
-    shorten,
     suffix_unit,
 )
 from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
@@ -40,19 +39,23 @@ from pipeline.datasets.check_readings import (
 from pipeline.datasets.check_sides import Baseline, Sides, format_baseline, read_sides
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.models import ModelFile, Parameter, write_text
-from pipeline.sources import Owner
+from pipeline.sources import Fault, Owner, convert_to
 from pipeline.store import Manifest, Store
 
 Outcome = Literal["kept", "broken", "undetermined"]
 _HINT = "The handbook, Check a change, lists the keys."
 
 
+Limit = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+"""In SI units, or a fraction; no quantity of a model is larger."""
+
+
 class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One limit: `min` and `max` of the value in AFTER, `change` as a fraction of the value in BEFORE."""
 
-    min: float | None = None
-    max: float | None = None
-    change: float | None = None
+    min: Limit | None = None
+    max: Limit | None = None
+    change: Limit | None = None
 
 
 class ErrorBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,16 +105,19 @@ def read_limits(path: Path) -> Limits:
     try:
         tree = parse_toml(read_bounded_text(path))
         require_finite(tree)
-        limits = msgspec.convert(tree, Limits)
     except OSError as error:
         what = f"the limits cannot be read ({error.strerror})"
         raise ComparisonError("bad_limits", what, where=str(path), hint=_HINT) from error
     except TomlError as error:
         where = str(path) if error.line is None else f"{path}, line {error.line}"
         raise ComparisonError("bad_limits", str(error), where=where, hint=_HINT) from error
-    except (UnicodeDecodeError, msgspec.ValidationError) as error:
-        what = f"the limits are not valid: {shorten(str(error))}"
+    except UnicodeDecodeError as error:
+        what = f"the limits are not valid: {error}"
         raise ComparisonError("bad_limits", what, where=str(path), hint=_HINT) from error
+    limits = convert_to(Limits, tree)
+    if isinstance(limits, Fault):
+        what = f"the limits are not valid: {limits.what}"
+        raise ComparisonError("bad_limits", what, where=str(path), hint=limits.hint or _HINT)
     for name, bound in _list_bounds(limits):
         _require_sense(path, name, bound)
     if not any(True for _ in _list_bounds(limits)):

@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import INPUTS, NORMAL_95, Floats, SlipError, finite_or_none, read_bounded, shorten
+from pipeline.core import INPUTS, NORMAL_95, Floats, SlipError, finite_or_none, read_bounded
 from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.datasets.check_readings import (
     LOGARITHMS,
@@ -42,7 +42,7 @@ from pipeline.recording.log_setup import UNKNOWN
 from pipeline.results import read_model
 from pipeline.run import MotionRun, load_motion_run
 from pipeline.sources import Owner, agree_on_vehicle, load_vehicle
-from pipeline.store import Manifest, Store
+from pipeline.store import Manifest, Store, StoreError, decode_stored
 
 BASELINE_FORMAT = 1
 _MOST_OF_SPREAD = 16
@@ -408,12 +408,12 @@ def read_baseline(path: Path) -> Baseline:
     """
     hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
     try:
-        stored = msgspec.json.decode(read_bounded(path), type=_StoredBaseline)
+        stored = decode_stored(read_bounded(path), _StoredBaseline, path)
     except OSError as error:
         what = f"the baseline cannot be read ({error.strerror})"
         raise ComparisonError("bad_baseline", what, where=str(path), hint=hint) from error
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-        what = f"this is not a baseline: {shorten(str(error))}"
+    except StoreError as error:
+        what = f"this is not a baseline: {error.what}"
         raise ComparisonError("bad_baseline", what, where=str(path), hint=hint) from error
     file = parse_model(stored.model, path)
     names = (*(label.name for label in list_labels(file.model, file.per_run)), *LOGARITHMS)

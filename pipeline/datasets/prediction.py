@@ -1,13 +1,13 @@
 """Fleet model of the results, and its prediction of a run on a terrain."""
 
 import contextlib
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
+import msgspec
 import numpy as np
 import polars as pl
 
@@ -23,7 +23,6 @@ from pipeline.core import (
     format_count,
     guess_names,
     pick,
-    read_bounded,
 )
 from pipeline.datasets.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast, fit_fleet, make_effects
@@ -35,7 +34,16 @@ from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.models import Effect, Model, ModelFile, Timing, cut_interval, find_effect
 from pipeline.run import TABLE_COLUMNS, MotionError, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
-from pipeline.store import Manifest, Store, lack_runs, no_results, read_day, read_length_scale
+from pipeline.store import (
+    Manifest,
+    Store,
+    convert_stored,
+    lack_runs,
+    no_results,
+    read_day,
+    read_length_scale,
+    read_stored,
+)
 from schemas import contract_of
 
 FLEET = "fleet.json"
@@ -96,12 +104,47 @@ def _find_runs(store: Store, optional: Sequence[str] = (), vehicle: str = "") ->
     )
 
 
+class _StoredMean(msgspec.Struct):
+    """The value of a parameter on a terrain."""
+
+    value: float
+
+
+class _StoredNumber(msgspec.Struct):
+    """What is shown of a parameter of the fleet."""
+
+    effect: str
+    parameter: str
+    vehicle: str
+    name: str
+    because: str
+    value: float
+    unit: str | None
+    level: str | None
+    low: float | None
+    high: float | None
+    spread_terrain: float | None
+    spread_run: float | None
+    chi_square: float | None
+    terrains: dict[str, _StoredMean] | None
+
+
+class _StoredFleet(msgspec.Struct):
+    """What is shown of the stored fleet model."""
+
+    parameters: list[_StoredNumber]
+    runs: dict[str, list[str]]
+    keys: list[str]
+    notes: list[str]
+    summary: str
+
+
 def read_fleet(store: Store) -> dict[str, object]:
     """The JSON object of the stored fleet model; its `notes` state whether results have changed since.
 
     Raises:
-        ComparisonError: ``no_fleet``: there is none, or it cannot be read.
-        StoreError: ``no_results``.
+        ComparisonError: ``no_fleet``: there is none.
+        StoreError: ``no_results``; ``file_damaged``, it cannot be read.
     """
     path = store.root / FLEET
     hint = f"Fit it: slip fleet fit {store.root}"
@@ -111,14 +154,9 @@ def read_fleet(store: Store) -> dict[str, object]:
         raise ComparisonError(
             "no_fleet", "no fleet model was fitted to these results", where=str(path), hint=hint
         )
-    try:
-        content = json.loads(read_bounded(path))
-        known = set(content["keys"])
-        notes = list(content["notes"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ComparisonError(
-            "no_fleet", "the fleet model cannot be read", where=str(path), hint=hint
-        ) from error
+    content = read_stored(path, dict[str, object], hint=hint)
+    stored = convert_stored(content, _StoredFleet, path, hint=hint)
+    known, notes = set(stored.keys), stored.notes
     now = set(_find_runs(store).keys)
     if now != known:
         notes.append(f"{len(now ^ known)} results have changed since: slip fleet fit brings it up to date")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUTS, PathError, SlipError, read_bounded
+from pipeline.core import INPUTS, SlipError
 from pipeline.results import RunDiagnosis, read_model, read_result, to_json
 from pipeline.run import MotionError, load_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
@@ -28,6 +27,7 @@ from pipeline.store import (
     locate_beside,
     make_folder,
     read_length_scale,
+    read_stored,
     replace_file,
     stored_contexts,
     stored_keys,
@@ -163,24 +163,21 @@ def read_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
     is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
     if not is_whole or not has_diagnosis(manifest, key_diagnosis(keys)):
         return None
-    diagnosis = read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
+    diagnosis = _read_whole(manifest)
     return diagnosis if diagnosis.input else None
 
 
 def read_stored_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
-    """The diagnosis in the results of a run, also one of an earlier version.
-
-    Returns:
-        None if there is none, or one of a version that this one cannot read.
+    """The diagnosis in the results of a run, also one of an earlier version; None if there is none.
 
     Raises:
-        StoreError: it is damaged.
+        StoreError: it is damaged, or of a version that this one cannot read.
     """
-    if DIAGNOSIS not in manifest.files:
-        return None
-    with suppress(msgspec.ValidationError):
-        return read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
-    return None
+    return _read_whole(manifest) if DIAGNOSIS in manifest.files else None
+
+
+def _read_whole(manifest: Manifest) -> RunDiagnosis:
+    return read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis, manifest.path(DIAGNOSIS))
 
 
 def diagnose_stored(
@@ -266,12 +263,12 @@ def find_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
 
 def _read_stored(results: Path, run: str, key: str) -> RunDiagnosis | None:
     """What `keep_diagnosis` stored of a run under a key."""
-    try:
-        path = locate_beside(results, "diagnoses", run, ".json")
-        stored = msgspec.json.decode(read_bounded(path), type=_StoredDiagnosis)
-    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+    path = locate_beside(results, "diagnoses", run, ".json")
+    if not path.is_file():
         return None
-    return read_result(stored.diagnosis, RunDiagnosis) if stored.key == key else None
+    hint = "Remove it: it is made again"
+    stored = read_stored(path, _StoredDiagnosis, hint=hint)
+    return read_result(stored.diagnosis, RunDiagnosis, path) if stored.key == key else None
 
 
 def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: RunDiagnosis) -> None:

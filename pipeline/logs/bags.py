@@ -42,8 +42,6 @@ _REPAIRS: Final = {rec.ROS1_BAG: "`rosbag reindex`", rec.SQLITE_BAG: "`sqlite3 F
 _TOGETHER: Final = 4 << 20
 """Size of the payloads that are passed on together [bytes]."""
 
-_LAST_TIME: Final = (1 << 63) - 1
-
 _MOST_LOSSES: Final = 20
 """Maximum number of losses of a bag that are told one by one."""
 
@@ -90,7 +88,7 @@ def catalog_bag(source: ByteSource, container: str, max_inflated: int | None) ->
             )
             catalog.counts[topic.number] = topic.messages
         if any(catalog.counts.values()):
-            catalog.start_ns, catalog.end_ns = bag.times
+            catalog.start_ns, catalog.end_ns = map(rec.clip_time, bag.times)
         catalog.bag_chunks, catalog.compressions = bag.chunk_count, bag.compressions
         catalog.losses += bag.losses
     if not rec.is_whole(source.read_at(0, rec.LONGEST_HEAD), source.size):
@@ -112,10 +110,11 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -
     Raises:
         LogError: ``log_unreadable``.
     """
-    collected = _Collected(Allowance(most, most))
     if not numbers:
         return
     with _open(path, container) as bag:
+        # A clock that is not set shows no time at all; a time of a few messages is damaged.
+        collected = _Collected(Allowance(most, most), bag.times[1] < 0 or bag.times[0] > rec.LATEST_NS)
         try:
             for number, at, data in bag.read_messages(numbers, Allowance(most, most)):
                 collected.add(number, at, data)
@@ -139,9 +138,10 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -
 
 @dataclass(slots=True)
 class _Collected:
-    """Messages that are not yet passed on."""
+    """Messages that are not yet passed on, and whether the clock of the recorder was not set."""
 
     allowance: Allowance
+    unset: bool
     size: int = 0
     count: int = 0
     odd: int = 0
@@ -150,7 +150,10 @@ class _Collected:
     messages: dict[int, tuple[list[int], list[Buffer]]] = field(default_factory=dict)
 
     def add(self, number: int, at: object, data: object) -> None:
-        if not isinstance(at, int) or not 0 <= at <= _LAST_TIME or not isinstance(data, bytes):
+        if not isinstance(at, int) or not isinstance(data, bytes):
+            self.odd += 1
+            return
+        if not self.unset and at != rec.clip_time(at):
             self.odd += 1
             return
         try:
@@ -160,11 +163,11 @@ class _Collected:
             return
         self.allowance.take(len(payload))
         times, payloads = self.messages.setdefault(number, ([], []))
-        times.append(at)
+        times.append(rec.clip_time(at))
         payloads.append(payload)
         self.size += len(payload)
         self.count += 1
-        self.last = at
+        self.last = times[-1]
 
     def take(self) -> dict[int, Payloads]:
         taken = {
@@ -284,7 +287,7 @@ class _RosBag:
             _Topic(one.id, one.topic, one.msgtype, "ros1", "ros1msg", one.msgdef.data, one.msgcount)
             for one in self._reader.connections
         ]
-        self.times = max(0, self._reader.start_time), min(_LAST_TIME, self._reader.end_time - 1)
+        self.times = self._reader.start_time, self._reader.end_time - 1
         self.chunk_count = len(self._reader.chunks)
         self.compressions = {_name_compression(chunk) for chunk in self._reader.chunks.values()}
         self.losses = self._find_unindexed(broken)
@@ -503,12 +506,12 @@ class _Database:
         described = "SELECT hidden FROM sqlite_master, pragma_table_xinfo(sqlite_master.name)"
         if _COMPUTED & {hidden for (hidden,) in self._query(described)}:
             raise InflateError("its tables have computed columns, which no recorder writes")
-        whole = "typeof(timestamp) = 'integer' AND timestamp >= 0"
+        whole = "min(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'"
         counted = {
             number: (count, first, last)
             for number, count, first, last in self._query(
-                "SELECT topic_id, count(*), min(timestamp) FILTER (WHERE "  # noqa: S608 - our own words
-                f"{whole}), max(timestamp) FILTER (WHERE {whole}) FROM messages GROUP BY topic_id"
+                f"SELECT topic_id, count(*), coalesce({whole} AND timestamp >= 0), {whole})), "  # noqa: S608 - our own words
+                f"{whole.replace('min', 'max', 1)}) FROM messages GROUP BY topic_id"
             )
         }
         timed = [(first, last) for _, first, last in counted.values() if first is not None]

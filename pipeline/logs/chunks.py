@@ -159,9 +159,6 @@ def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO
 CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
 """Kinds of record that occur in a chunk."""
 
-_LAST_TIME: Final = np.uint64((1 << 63) - 1)
-"""Maximum valid log time [ns], in the year 2262; later ones indicate damage."""
-
 FIRST_PRIVATE: Final = 0x80
 """First private opcode; the specification requires that such records are skipped."""
 
@@ -244,8 +241,9 @@ def locate_messages(
         if located.offsets:
             offsets = np.sort(np.append(offsets, np.array(located.offsets, dtype=np.int64)))
             heads = _heads(data, offsets)
-    absurd = heads["log_time"] > _LAST_TIME
-    if absurd.any():
+    absurd = heads["log_time"] > rec.LATEST_NS
+    # Most of the messages are recorded by a clock that was not set; a few are damaged.
+    if 0 < 2 * int(absurd.sum()) <= absurd.size:
         located.damage += [(int(offset), int(offset) + MESSAGE_OVERHEAD) for offset in offsets[absurd]]
         offsets, heads = offsets[~absurd], heads[~absurd]
     return Messages(
@@ -253,8 +251,8 @@ def locate_messages(
         size=heads["length"].astype(np.int64) - (MESSAGE_OVERHEAD - rec.HEAD_SIZE),
         channel=heads["channel"].copy(),
         sequence=heads["sequence"].copy(),
-        log_time=heads["log_time"].astype(np.int64),
-        publish_time=np.minimum(heads["publish_time"], _LAST_TIME).astype(np.int64),
+        log_time=np.minimum(heads["log_time"], rec.LATEST_NS).astype(np.int64),
+        publish_time=np.minimum(heads["publish_time"], rec.LATEST_NS).astype(np.int64),
         descriptions=located.descriptions,
         damage=located.damage,
         walked=agreed is None,

@@ -128,8 +128,8 @@ Column: TypeAlias = Numbers | Ragged | Strings | RaggedStrings
 STAMPS: Final = ("header.stamp.", "timestamp.")
 """Paths of the stamps in messages: ROS headers, and the protobuf and JSON types of Foxglove."""
 
-_LATEST_S: Final = 1 << 33
-"""Largest magnitude of a valid stamp [s]: up to the year 2242, and as long before 1970."""
+_LATEST_S: Final = 1 << 32
+"""Largest magnitude of a valid stamp [s]: up to the year 2106, and as long before 1970."""
 
 _INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
 

@@ -29,7 +29,7 @@ from pipeline.logs.part import (
     open_source,
     version_of,
 )
-from pipeline.logs.records import LogError, Loss
+from pipeline.logs.records import LATEST_NS, LogError, Loss
 from pipeline.logs.remote import to_location
 
 SUFFIXES: Final = (".mcap", *(f".mcap{end}" for end in COMPRESSED), ".db3", ".bag")
@@ -401,6 +401,8 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
             f"and not {name_first(omitted)}"
         )
         losses = [*losses, Loss("too_large", text)]
+    end_ns = max((each.end_ns for each in catalogs if each.end_ns is not None), default=0)
+    unset = ("the recorder's clock is not set: it shows times after the year 2116",)
     return LogIndex(
         path=path,
         size_bytes=sum(part.size_bytes for part in parts),
@@ -411,12 +413,12 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
         ),
         chunk_count=sum(catalog.count_chunks() for catalog in catalogs),
         start_ns=min((each.start_ns for each in catalogs if each.start_ns is not None), default=0),
-        end_ns=max((each.end_ns for each in catalogs if each.end_ns is not None), default=0),
+        end_ns=end_ns,
         channels=tuple(channels.values()),
         metadata=dict(record for catalog in catalogs for record in catalog.metadata),
         attachments=tuple(name for catalog in catalogs for name in catalog.attachments),
         losses=(*losses, *(loss for catalog in catalogs for loss in catalog.losses)),
-        notes=tuple(note for catalog in catalogs for note in catalog.notes),
+        notes=(*(note for catalog in catalogs for note in catalog.notes), *unset * (end_ns >= LATEST_NS)),
         parts=tuple(parts),
         fetched_bytes=fetched,
     )

@@ -82,9 +82,6 @@ _MAX_LINES: Final = 12_000_000
 _KEPT_NS: Final = 1_000
 """Resolution of times [ns]: a double resolves seconds since 1970 to about one microsecond."""
 
-_LATEST_NS: Final = float(1 << 62)
-"""Upper limit of valid times [ns], in the year 2116."""
-
 _CHANNEL: Final = 1
 """Channel number of a table, which has only one channel."""
 
@@ -259,7 +256,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
     values = _parse_lines(lines, separator, places)
     with np.errstate(invalid="ignore"):
         at = np.rint(values[:, 0] * (table.tick_ns / _KEPT_NS))
-        good = (at >= 0.0) & (at < _LATEST_NS / _KEPT_NS)
+        good = (at >= 0.0) & (at < rec.LATEST_NS / _KEPT_NS)
     if not (good.all() and len(lines) == at.size):
         count = len(lines) - int(good.sum())
         losses.append(Loss("damaged_record", f"{count} lines of {table.path} cannot be read"))

@@ -369,8 +369,8 @@ def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int,
                 chunk.chunk_start_offset,
                 chunk.chunk_length,
                 chunk.message_index_length,
-                chunk.message_start_time,
-                chunk.message_end_time,
+                rec.clip_time(chunk.message_start_time),
+                rec.clip_time(chunk.message_end_time),
                 frozenset(chunk.message_index_offsets) or None,
                 StoredAs(chunk.compression, chunk.compressed_size, chunk.uncompressed_size),
                 chunk.uncompressed_size,
@@ -413,7 +413,8 @@ def _take_statistics(catalog: Catalog, summary: _Summary) -> bool:
         return False
     catalog.counts = dict(statistics.channel_message_counts)
     if statistics.message_count:
-        catalog.start_ns, catalog.end_ns = statistics.message_start_time, statistics.message_end_time
+        catalog.start_ns = rec.clip_time(statistics.message_start_time)
+        catalog.end_ns = rec.clip_time(statistics.message_end_time)
     return True
 
 

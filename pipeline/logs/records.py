@@ -152,6 +152,15 @@ _INDEX_HEAD: Final = struct.Struct("<HI")
 _ENTRY_SIZE: Final = 16
 
 
+LATEST_NS: Final = 1 << 62
+"""Latest time of a clock [ns], in the year 2116: the difference of any two times then has 64 bits."""
+
+
+def clip_time(time: int) -> int:
+    """A time of a recorder's clock [ns], which is 0 or `LATEST_NS` where no clock shows it."""
+    return min(max(time, 0), LATEST_NS)
+
+
 class RecordError(ValueError):
     """A record whose body does not match its opcode."""
 
@@ -261,7 +270,9 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
     stored = int.from_bytes(body[position : position + 8], "little")
     if stored > body_size - position - 8:
         raise RecordError("a chunk says it is longer than its record")
-    return ChunkHead(start, end, size, crc, compression, stored, HEAD_SIZE + position + 8)
+    return ChunkHead(
+        clip_time(start), clip_time(end), size, crc, compression, stored, HEAD_SIZE + position + 8
+    )
 
 
 def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:

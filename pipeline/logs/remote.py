@@ -15,7 +15,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
-from pipeline.core import MOST_BYTES, too_large
+from pipeline.core import MOST_BYTES, TooLargeError
 from pipeline.logs.records import LogError
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ class RemotePath(PosixPath):
         """
         del mode
         if cast("int", self.look()["size"]) > MOST_BYTES:
-            raise too_large(self)
+            raise TooLargeError(self)
         return io.BytesIO(self.read_bytes())
 
     def read_bytes(self) -> bytes:

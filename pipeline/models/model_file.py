@@ -8,9 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
-
-from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, require_finite, shorten
+from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, shorten
 from pipeline.models.catalogue import (
     EffectClass,
     find_effect,
@@ -26,7 +24,15 @@ from pipeline.models.learned_term import parse_learned
 from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run import MotionError
-from pipeline.sources import ConfigurationError, StandIn, Vehicle, VehicleSection, resolve_vehicle
+from pipeline.sources import (
+    ConfigurationError,
+    Fault,
+    StandIn,
+    Vehicle,
+    VehicleSection,
+    convert_to,
+    resolve_vehicle,
+)
 
 FORMAT = 1
 """Version of the format of model files; other versions are rejected."""
@@ -308,14 +314,13 @@ class _Reader:
                 hint = _ABOVE if key in _SECTIONS else f"Known are: {', '.join(fields)}."
                 what = f"unknown key {key!r} in [vehicle]"
                 raise self._error(what, hint, ("vehicle", 0), key, code="unknown_key")
+        section = convert_to(_VehicleTable, table)
+        if isinstance(section, Fault):
+            what, key = f"the vehicle is not valid: {section.what}", "".join(section.steps[:1])
+            hint = section.hint or "The handbook, Configuration, lists the keys."
+            raise self._error(what, hint, ("vehicle", 0), key, code="vehicle_invalid")
         try:
-            require_finite({"vehicle": table})
-            section = msgspec.convert(table, _VehicleTable)
             return resolve_vehicle(section, recorded=None, where=str(self.path))
-        except (msgspec.ValidationError, TomlError) as error:
-            key = error.key.rpartition(".")[2] if isinstance(error, TomlError) else ""
-            what, hint = f"the vehicle is not valid: {error}", "The handbook, Configuration, lists the keys."
-            raise self._error(what, hint, ("vehicle", 0), key, code="vehicle_invalid") from None
         except ConfigurationError as error:
             raise self._repeat(error, ("vehicle", 0), "preset") from None
 

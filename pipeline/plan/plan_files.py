@@ -327,8 +327,13 @@ def find_likeness(asked: Floats, seen: Floats) -> float:
 
 
 def _read_plan(path: Path, vehicle: Vehicle) -> Floats:
-    names, *rows = csv.reader(read_bounded_text(path).splitlines())
-    _, speed, turn = np.array(rows, dtype=np.float64).T
+    try:
+        names, *rows = csv.reader(read_bounded_text(path).splitlines())
+        _, speed, turn = np.array(rows, dtype=np.float64).T
+    except (OSError, ValueError, csv.Error) as error:
+        what = "this is not a plan.csv that `slip plan` wrote"
+        hint = "Give the folder that `slip plan` wrote."
+        raise PlanError("no_plan", what, where=str(path), hint=hint) from error
     if names[-1].startswith("steering"):
         _, _, turn = vehicle.kinematics.asked({"speed": speed, "steering": turn}, vehicle)
     return np.column_stack((speed, turn))

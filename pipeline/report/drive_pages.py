@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import PathError, read_bounded, read_bounded_text, resolve_inside
+from pipeline.core import PathError, read_bounded_text, resolve_inside
 from pipeline.plan import SAFETY, Plan, list_gains
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, set_squares, theme
 from pipeline.report.page import render_figures
@@ -22,7 +22,16 @@ from pipeline.report.theme import (
     share_rows,
     stack,
 )
-from pipeline.store import REPORT, Manifest, Store, encode_run, make_folder, replace_file
+from pipeline.store import (
+    REPORT,
+    Manifest,
+    Store,
+    StoreError,
+    encode_run,
+    make_folder,
+    read_stored,
+    replace_file,
+)
 
 # Subsampling of poses, and the largest number of predicted paths.
 _EVERY = 4
@@ -195,8 +204,8 @@ def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
         key: key of its generation.
     """
     try:
-        preview = msgspec.json.decode(read_bounded(locate_plan(results, run, PREVIEW)), type=_Preview)
-    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        preview = read_stored(locate_plan(results, run, PREVIEW), _Preview)
+    except (StoreError, PathError):
         return {}
     address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
     return {**msgspec.structs.asdict(preview), "address": address} if preview.key == key else {}

@@ -17,7 +17,7 @@ from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
 from pipeline.report.scene import CAP_QUANTILE, INPUTS
 from pipeline.run import TABLE_COLUMNS, MotionError, MotionRun, make_motion_run
-from pipeline.store import Manifest, check_rows, name_damage
+from pipeline.store import Manifest, check_size, name_damage
 
 
 class Feed:
@@ -89,7 +89,7 @@ class ExportSource:
             return
 
         path = self.manifest.path(table)
-        check_rows(path, self.manifest.count_rows(table))
+        check_size(path, self.manifest.count_rows(table))
         with name_damage(path), pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
             for batch in file.iter_batches(
                 BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None

@@ -3,14 +3,14 @@
 import contextlib
 import itertools
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import TREND_THRESHOLD, Floats, format_count, read_bounded
+from pipeline.core import TREND_THRESHOLD, Floats, format_count
 from pipeline.datasets import (
     TREND,
     WHISKER_REACH,
@@ -29,7 +29,7 @@ from pipeline.models import name_parameter
 from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme, write_page
 from pipeline.report.page import render_figures
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer
-from pipeline.store import NoRunsError, Store
+from pipeline.store import NoRunsError, Store, StoreError, read_stored
 
 _FEWEST_POINTS = 3
 _LIMITS = ("limit_low", "limit_high")
@@ -269,18 +269,27 @@ def renew_trend(store: Store) -> Trend:
     return trend
 
 
+class _Asked(msgspec.Struct):
+    """Options of a trend."""
+
+    by: list[str]
+    threshold: float
+    limits: dict[str, float]
+
+
+class _StoredTrend(msgspec.Struct):
+    """What is read of a stored trend."""
+
+    asked: _Asked
+
+
 def _read_asked(store: Store) -> tuple[Sequence[str], float, Mapping[str, float]] | None:
     """Options of the trend that was made last; None where there is none, or it cannot be read."""
     path = store.root / TREND
     if not path.is_file():
         return None
     try:
-        asked = json.loads(read_bounded(path))["asked"]
-        limits = {str(name): float(value) for name, value in asked["limits"].items()}
-        by = [str(name) for name in asked["by"]]
-        threshold = float(asked["threshold"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        asked = read_stored(path, _StoredTrend).asked
+    except StoreError:
         return None
-    if not all(math.isfinite(value) for value in (threshold, *limits.values())):
-        return None
-    return by, threshold, limits
+    return asked.by, asked.threshold, asked.limits

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TypeVar, cast
 
 import msgspec
@@ -11,6 +12,7 @@ from msgspec.structs import replace
 
 from pipeline.core import JSON_DIGITS, count_places, finite_or_none
 from pipeline.sources import Vehicle
+from pipeline.store import convert_stored
 
 Result = TypeVar("Result", bound=msgspec.Struct)
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -603,13 +605,18 @@ def _round(value: object) -> object:
     return [_round(one) for one in value] if isinstance(value, list | tuple) else value
 
 
-def read_result(content: Mapping[str, object], kind: type[Result]) -> Result:
+def read_result(content: Mapping[str, object], kind: type[Result], where: Path = Path()) -> Result:
     """A result from its JSON object, stored now or by an earlier version.
 
+    Args:
+        content: the object.
+        kind: class of the result.
+        where: its file.
+
     Raises:
-        ValidationError: a key has another type.
+        StoreError: ``file_damaged``, a key has another type.
     """
-    return msgspec.convert(_fill(content), kind, strict=False)
+    return convert_stored(_fill(content), kind, where, strict=False)
 
 
 def _fill(value: object, key: str = "") -> object:

@@ -44,13 +44,16 @@ if TYPE_CHECKING:
         find_preset,
         list_factors,
         list_presets,
+        list_ranges,
         resolve_vehicle,
     )
     from pipeline.sources.kinematics import list_kinds
     from pipeline.sources.layers import (
         FLEET_FILE,
         RUN_FILE,
+        Fault,
         convert,
+        convert_to,
         is_model,
         list_configuration_files,
         load_configuration,

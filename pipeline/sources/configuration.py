@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
-from pipeline.core import SlipError, guess_names
+from pipeline.core import SlipError, guess_names, suffix_unit
 from pipeline.sources.kinematics import Kinematics, find_kinematics, list_kinds
 
 
@@ -22,7 +22,27 @@ class ConfigurationError(SlipError):
 #
 # Every section is optional. Unknown keys are errors, so that a misspelt one is not silently ignored.
 
+# Every number has a range in SI units, so that no value can break the arithmetic of a stage.
+
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Radius = Annotated[float, msgspec.Meta(ge=1e-3, le=2.5)]
+Track = Annotated[float, msgspec.Meta(ge=5e-3, le=15.0)]
+Wheelbase = Annotated[float, msgspec.Meta(ge=5e-3, le=25.0)]
+AxleDistance = Annotated[float, msgspec.Meta(ge=-25.0, le=25.0)]
+Mass = Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)]
+Rate = Annotated[float, msgspec.Meta(ge=1e-3, le=100.0)]
+"""A vehicle's largest speed [m/s] or yaw rate [rad/s]."""
+Steering = Annotated[float, msgspec.Meta(ge=1e-3, le=math.pi)]
+TrackMultiplier = Annotated[float, msgspec.Meta(ge=1e-2, le=100.0)]
+# Bounds of a vehicle: above the largest mining trucks (wheels of 2.0 m, a track of 9 m, a wheelbase of 8 m,
+# 620 t), and below robots of a centimetre.
+
+Instant = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+"""A time after the start of a log, or a difference of two clocks [s]: 30 years."""
+Span = Annotated[float, msgspec.Meta(ge=1e-3, le=86400.0)]
+"""A duration [s]: from the resolution of clocks to a day."""
+Factor = Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)]
+"""Factor of a side or a joint; encoders in the smallest and the largest known unit differ by less."""
 RunningGear = Literal["wheels", "tracks"]
 KIND_WORDS: Mapping[str, Mapping[str, str]] = {
     "skid_steer": {"kind": "differential"},
@@ -67,15 +87,15 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     preset: str | None = None
     name: str | None = None
     kind: KindWord | None = None
-    wheel_radius_m: Positive | None = None
-    track_width_m: Positive | None = None
-    wheelbase_m: Positive | None = None
-    base_to_rear_axle_m: float | None = None
-    mass_kg: Positive | None = None
-    max_speed_mps: Positive | None = None
-    max_yaw_rate_radps: Positive | None = None
-    max_steering_rad: Positive | None = None
-    controller_track_multiplier: Positive | None = None
+    wheel_radius_m: Radius | None = None
+    track_width_m: Track | None = None
+    wheelbase_m: Wheelbase | None = None
+    base_to_rear_axle_m: AxleDistance | None = None
+    mass_kg: Mass | None = None
+    max_speed_mps: Rate | None = None
+    max_yaw_rate_radps: Rate | None = None
+    max_steering_rad: Steering | None = None
+    controller_track_multiplier: TrackMultiplier | None = None
     running_gear: RunningGear | None = None
 
     def list_values(self) -> dict[str, object]:
@@ -108,8 +128,8 @@ class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """
 
     side: Literal["left", "right", "both"] = "both"
-    start_s: float | None = None
-    end_s: float | None = None
+    start_s: Instant | None = None
+    end_s: Instant | None = None
 
 
 class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -155,19 +175,19 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     steering_topic: str | None = None
     steering_joint: str | None = None
     unit: Unit | None = None
-    per_turn: Positive | None = None
+    per_turn: Annotated[float, msgspec.Meta(ge=1e-2, le=1e9)] | None = None
     yaw_unit: Literal["rad/s", "deg/s", "mrad/s"] | None = None
     steering_unit: Literal["rad", "deg"] | None = None
     sign: Literal[1, -1] = 1
     reversed: Literal["left", "right"] | None = None
     exchanged: bool = False
-    scale: Positive | None = None
-    factors: dict[str, float] | None = None
+    scale: Annotated[float, msgspec.Meta(ge=1e-4, le=1e4)] | None = None
+    factors: dict[str, Factor] | None = None
     ignore: list[OutageSection] | None = None
     interpolate: bool = False
     time: Clock | None = None
-    late_s: float | None = None
-    hold_s: Positive | None = None
+    late_s: Instant | None = None
+    hold_s: Span | None = None
 
 
 LENGTH_UNITS: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -233,19 +253,19 @@ class VelocitySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         gap_s: shortest gap between poses that cuts a segment.
     """
 
-    rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 20.0
+    rate_hz: Annotated[float, msgspec.Meta(ge=0.1, le=1000.0)] = 20.0
     window_s: Annotated[float, msgspec.Meta(ge=0.05, le=10.0)] = 0.75
     yaw: Literal["pose", "imu"] = "pose"
-    jump_m: Positive = 0.1
-    jump_rad: Positive = 0.1
-    gap_s: Positive = 0.12
+    jump_m: Annotated[float, msgspec.Meta(ge=1e-6, le=1e6)] = 0.1
+    jump_rad: Annotated[float, msgspec.Meta(ge=1e-6, le=2.0 * math.pi)] = 0.1
+    gap_s: Span = 0.12
 
 
 class SlipSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[slip]``: the length scale L of the modulus and the transitory span after a command step."""
 
-    length_scale_m: Positive = 1.0
-    transitory_s: Positive = 2.0
+    length_scale_m: Annotated[float, msgspec.Meta(ge=1e-3, le=1e3)] = 1.0
+    transitory_s: Span = 2.0
 
 
 class IntervalSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -253,8 +273,8 @@ class IntervalSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     topic: str | None = None
     equals: str | None = None
-    start_s: float | None = None
-    end_s: float | None = None
+    start_s: Instant | None = None
+    end_s: Instant | None = None
 
 
 class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -441,23 +461,46 @@ def resolve_vehicle(
     return _require_geometry(msgspec.structs.replace(base, **values), where)
 
 
-RANGES: Final = {
-    "wheel_radius_m": (1e-3, 2.5),
-    "track_width_m": (5e-3, 15.0),
-    "wheelbase_m": (5e-3, 25.0),
-    "base_to_rear_axle_m": (-25.0, 25.0),
-    "mass_kg": (1e-3, 1e6),
-    "max_speed_mps": (1e-3, 100.0),
-    "max_yaw_rate_radps": (1e-3, 100.0),
-    "max_steering_rad": (1e-3, math.pi),
-    "controller_track_multiplier": (1e-2, 100.0),
-}
-"""Bounds of a vehicle's values in SI units: above the largest mining trucks (wheels of 2.0 m, a track of 9 m,
-a wheelbase of 8 m, 620 t), and below robots of a centimetre."""
+def list_ranges(kind: type[msgspec.Struct]) -> dict[str, tuple[float, float]]:
+    """Smallest and largest allowed value of the numbers of a section, by key."""
+    fields = msgspec.inspect.type_info(kind).fields  # type: ignore[attr-defined]
+    ranges = {field.encode_name: list_bounds(field.type) for field in fields}
+    return {key: bounds for key, bounds in ranges.items() if bounds is not None}
+
+
+def list_bounds(kind: msgspec.inspect.Type) -> tuple[float, float] | None:
+    """Smallest and largest value of a type; None if it is not that of a number."""
+    kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
+    for one in kinds:
+        if isinstance(one, msgspec.inspect.FloatType | msgspec.inspect.IntType):
+            return (
+                -math.inf if one.ge is None else float(one.ge),
+                math.inf if one.le is None else float(one.le),
+            )
+    return None
+
+
+RANGES: Final = list_ranges(VehicleSection)
+"""Bounds of a vehicle's values in SI units, by name."""
 _SMALLER: Final = {
     "m": (("centimetres", 1e-2), ("millimetres", 1e-3)),
     "rad": (("degrees", math.pi / 180.0),),
+    "s": (("milliseconds", 1e-3),),
 }
+_UNITS: Final = {"mps": "m/s", "radps": "rad/s", "hz": "Hz", "deg": "degrees"}
+"""Units by the end of a key that is not the unit itself."""
+_PLAIN_UNITS: Final = ("m", "s", "rad", "kg")
+
+
+def explain_range(key: str, value: float, bounds: tuple[float, float]) -> tuple[str, str]:
+    """What is wrong with a number outside its range, with its unit, and a hint."""
+    least, largest = bounds
+    end = key.rpartition(".")[2].rpartition("_")[2]
+    fits = ((word, value * factor) for word, factor in _SMALLER.get(end, ()))
+    meant = next(((word, number) for word, number in fits if least <= number <= largest), None)
+    unit = end if end in _PLAIN_UNITS else _UNITS.get(end)
+    what = f"{key} = {value:g} is outside its range, {least:g} to {largest:g}{suffix_unit(unit)}"
+    return what, f"If it is in {meant[0]}, write {meant[1]:g}." if meant else "Write a value of that range."
 
 
 def _require_geometry(vehicle: Vehicle, where: str) -> Vehicle:
@@ -481,22 +524,11 @@ def check_geometry(vehicle: Vehicle, where: str) -> None:
     Raises:
         ConfigurationError: ``implausible_geometry``.
     """
-    for name, (least, largest) in RANGES.items():
+    for name, bounds in RANGES.items():
         value = getattr(vehicle, name)
-        if value is None or least <= value <= largest:
-            continue
-        unit = name.rpartition("_")[2]
-        limit, side = (largest, "more") if value > largest else (least, "less")
-        fits = ((word, value * factor) for word, factor in _SMALLER.get(unit, ()))
-        meant = next(((word, number) for word, number in fits if least <= number <= largest), None)
-        raise ConfigurationError(
-            "implausible_geometry",
-            f"{name} = {value:g} is {side} than any vehicle has ({limit:.3g})",
-            where=where,
-            hint=f"If it is in {meant[0]}, write {meant[1]:g}."
-            if meant
-            else f"Give the true value: {name} under [vehicle] in run.toml, or in the model file.",
-        )
+        if value is not None and not bounds[0] <= value <= bounds[1]:
+            what, hint = explain_range(name, value, bounds)
+            raise ConfigurationError("implausible_geometry", what, where=where, hint=hint)
 
 
 def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:

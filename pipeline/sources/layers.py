@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import msgspec
 
@@ -13,7 +14,9 @@ from pipeline.logs import stem_of
 from pipeline.sources.configuration import (
     Configuration,
     ConfigurationError,
+    explain_range,
     find_preset,
+    list_bounds,
     list_presets,
 )
 
@@ -22,31 +25,74 @@ _UNKNOWN = re.compile(r"unknown field `([^`]*)`")
 _VALUE = re.compile(r"value '([^']*)'")
 _STEP = re.compile(r"[A-Za-z_]\w*|\[")
 
+Tree = Mapping[str, object]
+Section = TypeVar("Section", bound=msgspec.Struct)
 
-def explain_fault(error: msgspec.ValidationError, where: str, source: Path | None) -> ConfigurationError:
-    """Convert a validation error of a configuration.
+
+class Fault(NamedTuple):
+    """A key or a value of a table that its schema refuses.
+
+    Attributes:
+        what: what is wrong, one line without a full stop.
+        hint: what to do about it; empty if that is not known.
+        steps: names of the keys that lead to it.
+        value: the refused word; empty if it is a number.
+    """
+
+    what: str
+    hint: str
+    steps: list[str]
+    value: str = ""
+
+
+def convert_to(kind: type[Section], tree: Tree) -> Section | Fault:
+    """Validate a table that a user wrote: unknown keys, words, types and the range of every number.
 
     Args:
-        error: validation error.
-        where: the file, or another source of the values.
-        source: the file, to locate the line.
+        kind: the class of its content.
+        tree: the table.
+
+    Returns:
+        The content, or what is wrong with it.
     """
-    message = str(error)
+    outside = next(_list_outside(msgspec.inspect.type_info(kind), tree, ""), None)
+    if outside is not None:
+        what, hint = explain_range(*outside)
+        return Fault(what, hint, [step for step in outside[0].split(".") if not step.startswith("[")])
+    try:
+        return msgspec.convert(tree, kind)
+    except msgspec.ValidationError as error:
+        message = str(error)
     key_path, unknown, value = (_find(pattern, message) for pattern in (_PLACE, _UNKNOWN, _VALUE))
     steps = _STEP.findall(key_path)
     if unknown:
-        keys = ", ".join(sorted(_list_keys(steps)))
-        hint = f"The keys there are: {keys}." if keys else "The handbook, Configuration, lists the keys."
+        keys = ", ".join(sorted(_list_keys(kind, steps)))
+        hint = f"The keys there are: {keys}." if keys else ""
         steps.append(unknown)
     else:
-        words = ", ".join(str(word) for word in _list_words(steps))
-        hint = f"Write one of: {words}." if words else "The handbook, Configuration, lists keys and units."
-    return ConfigurationError(
-        "config_invalid",
-        f"the configuration is not valid: {shorten(_readable(message))}",
-        where=_name_line(where, source, steps, value),
-        hint=hint,
-    )
+        words = ", ".join(str(word) for word in _list_words(kind, steps))
+        hint = f"Write one of: {words}." if words else ""
+    return Fault(shorten(_readable(message)), hint, [step for step in steps if step != "["], value)
+
+
+def _list_outside(
+    kind: msgspec.inspect.Type, value: object, key: str
+) -> Iterator[tuple[str, float, tuple[float, float]]]:
+    """Numbers of a table outside the range of their type: dotted key, number, range."""
+    for one in _spread([kind]):
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            bounds = list_bounds(one)
+            if bounds is not None and not bounds[0] <= value <= bounds[1]:
+                yield key, value, bounds
+        elif isinstance(value, Mapping):
+            inner = dict.fromkeys(value, one.value_type) if isinstance(one, msgspec.inspect.DictType) else {}
+            if isinstance(one, msgspec.inspect.StructType):
+                inner = {field.encode_name: field.type for field in one.fields}
+            for name in inner.keys() & value.keys():
+                yield from _list_outside(inner[name], value[name], f"{key}.{name}" if key else str(name))
+        elif isinstance(value, list) and isinstance(one, msgspec.inspect.ListType):
+            for number, item in enumerate(value, start=1):
+                yield from _list_outside(one.item_type, item, f"{key}.[{number}]")
 
 
 def check_preset(tree: Mapping[str, object], source: Path) -> None:
@@ -81,16 +127,18 @@ def _readable(message: str) -> str:
     )
 
 
-def _walk(steps: Iterable[str]) -> Iterator[msgspec.inspect.Type]:
-    """Possible types at a path in the configuration."""
-    kinds: list[msgspec.inspect.Type] = [msgspec.inspect.type_info(Configuration)]
+def _walk(kind: type[msgspec.Struct], steps: Iterable[str]) -> Iterator[msgspec.inspect.Type]:
+    """Possible types at a path in a section."""
+    kinds: list[msgspec.inspect.Type] = [msgspec.inspect.type_info(kind)]
     for step in steps:
         inner: list[msgspec.inspect.Type] = []
-        for kind in _spread(kinds):
-            if step == "[" and isinstance(kind, msgspec.inspect.ListType | msgspec.inspect.VarTupleType):
-                inner.append(kind.item_type)
-            elif isinstance(kind, msgspec.inspect.StructType):
-                inner += [field.type for field in kind.fields if field.encode_name == step]
+        for one in _spread(kinds):
+            if step == "[" and isinstance(one, msgspec.inspect.ListType | msgspec.inspect.VarTupleType):
+                inner.append(one.item_type)
+            elif step == "[" and isinstance(one, msgspec.inspect.DictType):
+                inner.append(one.value_type)
+            elif isinstance(one, msgspec.inspect.StructType):
+                inner += [field.type for field in one.fields if field.encode_name == step]
         kinds = inner
     return _spread(kinds)
 
@@ -103,14 +151,14 @@ def _spread(kinds: Iterable[msgspec.inspect.Type]) -> Iterator[msgspec.inspect.T
             yield kind
 
 
-def _list_words(steps: Iterable[str]) -> list[object]:
-    literals = (kind for kind in _walk(steps) if isinstance(kind, msgspec.inspect.LiteralType))
-    return [word for kind in literals for word in kind.values]
+def _list_words(kind: type[msgspec.Struct], steps: Iterable[str]) -> list[object]:
+    literals = (one for one in _walk(kind, steps) if isinstance(one, msgspec.inspect.LiteralType))
+    return [word for one in literals for word in one.values]
 
 
-def _list_keys(steps: Iterable[str]) -> list[str]:
-    structs = (kind for kind in _walk(steps) if isinstance(kind, msgspec.inspect.StructType))
-    return [field.encode_name for kind in structs for field in kind.fields]
+def _list_keys(kind: type[msgspec.Struct], steps: Iterable[str]) -> list[str]:
+    structs = (one for one in _walk(kind, steps) if isinstance(one, msgspec.inspect.StructType))
+    return [field.encode_name for one in structs for field in one.fields]
 
 
 def name_key(source: Path, key: str) -> str:
@@ -119,7 +167,7 @@ def name_key(source: Path, key: str) -> str:
 
 
 def _name_line(where: str, source: Path | None, steps: list[str], value: str) -> str:
-    number = None if source is None else _find_line(source, [step for step in steps if step != "["], value)
+    number = None if source is None else _find_line(source, steps, value)
     return where if number is None else f"{where}, line {number}"
 
 
@@ -151,8 +199,6 @@ def _read_header(line: str) -> str:
     name, closed, _ = text.lstrip("[").partition("]")
     return name.strip() if text.startswith("[") and closed else ""
 
-
-Tree = Mapping[str, object]
 
 FLEET_FILE = "fleet.toml"
 RUN_FILE = "run.toml"
@@ -270,10 +316,13 @@ def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configurat
     Raises:
         ConfigurationError: unknown key or wrong value, with its location.
     """
-    try:
-        return msgspec.convert(tree, Configuration)
-    except msgspec.ValidationError as error:
-        raise explain_fault(error, where, source) from None
+    content = convert_to(Configuration, tree)
+    if isinstance(content, Fault):
+        what = f"the configuration is not valid: {content.what}"
+        where = _name_line(where, source, content.steps, content.value)
+        hint = content.hint or "The handbook, Configuration, lists keys and units."
+        raise ConfigurationError("config_invalid", what, where=where, hint=hint)
+    return content
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -14,8 +14,9 @@ from typing import cast
 import numpy as np
 
 from pipeline.core import PAUSE_NS, Flags, Floats, Ints, format_duration, robust_spread
+from pipeline.logs import LATEST_NS
 from pipeline.stages import timing
-from pipeline.stages.findings import Finding, Severity
+from pipeline.stages.findings import Finding, Severity, StageError
 
 Stamps = Ints
 
@@ -124,6 +125,9 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
 
     Returns:
         The clocks by the same keys, and findings.
+
+    Raises:
+        StageError: ``no_clock``, the chosen time of a topic stands still.
     """
     pauses = find_pauses(times.log_time for times in recorded.values())
     recorded, simulated = _follow_simulated_time(_close_pauses(recorded, pauses))
@@ -135,12 +139,34 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
         text = describe_pauses(pauses, "no topic in use")
         jump = Finding("clock_jump", "warning", text, where="recorder", value=longest, count=count)
         findings.insert(0, jump)
+    unset = sum(int((times.log_time >= LATEST_NS).sum()) for times in recorded.values())
+    if unset:
+        text = (
+            f"{unset} messages were recorded by a clock that is not set: it shows a time after the year 2116"
+        )
+        findings.insert(0, Finding("clock_unset", "warning", text, where="recorder", count=unset))
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
+    for clock in clocks.values():
+        _require_advance(clock)
     findings += [finding for clock in clocks.values() for finding in clock.findings]
     findings += _check_early_stamps(clocks)
     shifted, joined = _join_time_bases(clocks)
     single, repeated = drop_repeated_stamps(shifted)
     return single, findings + joined + repeated
+
+
+def _require_advance(clock: TopicClock) -> None:
+    """Refuse a topic whose messages have no time.
+
+    Raises:
+        StageError: ``no_clock``.
+    """
+    times = clock.stamp[clock.usable]
+    if times.size >= timing.FEWEST_PIECES and not np.ptp(times):
+        which = "stamps" if clock.clock == "header" else f"{clock.clock} times"
+        what = f"the {which} of {clock.topic} stand still, and it has no other clock"
+        hint = "Record it with a clock that is set, or as a type with a header."
+        raise StageError("no_clock", what, where=clock.topic, hint=hint)
 
 
 def find_pauses(log_times: Iterable[Stamps]) -> list[tuple[int, int]]:

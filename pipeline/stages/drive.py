@@ -21,6 +21,7 @@ from pipeline.sources import (
     convert_unit,
     find_type,
     list_factors,
+    list_ranges,
 )
 from pipeline.stages import reading
 from pipeline.stages.findings import Finding, StageError
@@ -396,7 +397,9 @@ def read_signal(
     own = dict(vehicle.units)
     per_turn = section.per_turn
     if per_turn is None and signal.per_turn:
-        per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn))) or None
+        per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn)))
+        least, largest = list_ranges(DriveSection)["per_turn"]
+        per_turn = per_turn if least <= per_turn <= largest else None
     if per_turn is not None:
         own["ticks"] = OwnUnit(per_turn / (2.0 * np.pi), "rad")
     second = section.steering_unit if source.form is DriveForm.STEERING else section.yaw_unit

@@ -107,10 +107,11 @@ def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
     if (latest - stamp > JUMP_NS).any():
         return None
     # Of simultaneous messages the last is used, and only an advance of the clock is a knot.
-    last = np.append(np.diff(log_time) > 0, [True])
-    log, shown = log_time[last], latest[last]
+    log, shown = log_time.astype(np.float64), latest.astype(np.float64)
+    last = np.append(np.diff(log) > 0, [True])
+    log, shown = log[last], shown[last]
     new = np.append([True], np.diff(shown) > 0)
-    log, shown = log[new].astype(np.float64), shown[new].astype(np.float64)
+    log, shown = log[new], shown[new]
     return ClockMap(log, shown) if log.size >= FEWEST_PIECES else None
 
 

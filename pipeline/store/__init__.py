@@ -39,17 +39,17 @@ if TYPE_CHECKING:
     )
     from pipeline.store.parquet_tables import (
         CheckedTable,
-        check_rows,
+        check_size,
         check_table,
         encode_parquet,
         list_complaints,
     )
     from pipeline.store.results_folder import RUNS, Store, scan_table
+    from pipeline.store.stored_files import SUMMARY, convert_stored, decode_stored, read_stored
     from pipeline.store.stored_runs import (
         ANALYZE_FIRST,
         DIAGNOSIS,
         REPORT,
-        SUMMARY,
         UPLOADS,
         LogIdentities,
         LogSighting,

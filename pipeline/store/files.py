@@ -7,7 +7,6 @@ once and read them all through it.
 
 import errno
 import hashlib
-import json
 import os
 import platform
 import secrets
@@ -17,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import polars as pl
 
@@ -34,6 +33,7 @@ from pipeline.store.names import (
     path_unread,
     table_damaged,
 )
+from pipeline.store.stored_files import AGAIN, SUMMARY, StoredSummary, convert_stored, decode_stored
 
 TEMPORARY = ".tmp-"
 """How the names of unfinished files and folders begin; no reader looks at them."""
@@ -380,11 +380,10 @@ class Manifest:
             StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile;
                 ``table_damaged``, it cannot be read, or has not the columns of its contract.
         """
-        from pipeline.store.parquet_tables import check_rows, is_of_contract  # noqa: PLC0415 - heavy
+        from pipeline.store.parquet_tables import is_of_contract  # noqa: PLC0415 - heavy
 
         path = self.path(table)
-        check_rows(path, self.count_rows(table))
-        frame = read_parquet(path)
+        frame = read_parquet(path, self.count_rows(table))
         entry = self.tables.get(table)
         if entry is not None and not is_of_contract(table, entry.contract_version, frame.schema):
             raise table_damaged("its columns are not those of its contract", path)
@@ -405,17 +404,16 @@ class Manifest:
                 not what was written.
         """
         path = self.path(name)
-        try:
+        if not path.is_file():
+            raise file_missing(path)
+        with name_disk_errors(path):
             data = read_bounded(path)
-            content = json.loads(data) if hash_bytes(data) == self.files[path.name].sha256 else None
-        except FileNotFoundError as error:
-            raise file_missing(path) from error
-        except (OSError, ValueError, RecursionError):
-            content = None
-        if not isinstance(content, dict):
-            hint = "Analyze the log again with --force; `slip results verify` lists what else is damaged"
-            text = "the file has changed since it was written"
-            raise StoreError("file_damaged", text, where=str(path), hint=hint)
+        if hash_bytes(data) != self.files[path.name].sha256:
+            what = "the file has changed since it was written"
+            raise StoreError("file_damaged", what, where=str(path), hint=AGAIN)
+        content = decode_stored(data, dict[str, Any], path)
+        if name == SUMMARY:
+            convert_stored(content, StoredSummary, path)
         return content
 
     @property
@@ -488,12 +486,19 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_parquet(path: Path) -> pl.DataFrame:
-    """The frame in a table's file.
+def read_parquet(path: Path, rows: int | None = None) -> pl.DataFrame:
+    """The frame in a table's file, whose size is checked before any row is read.
+
+    Args:
+        path: the Parquet file.
+        rows: as the manifest has it; None where no manifest speaks of the file.
 
     Raises:
         StoreError: ``file_missing`` or ``table_damaged``.
     """
+    from pipeline.store.parquet_tables import check_size  # noqa: PLC0415 - heavy
+
+    check_size(path, rows)
     with name_damage(path):
         return pl.read_parquet(path, glob=False)
 

@@ -11,7 +11,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
-from pipeline.core import TOO_LARGE, PathError, SlipError, group_by, may_lead_out, resolve_inside
+from pipeline.core import PathError, SlipError, TooLargeError, group_by, may_lead_out, resolve_inside
 
 
 class StoreError(SlipError):
@@ -24,12 +24,30 @@ NO_FACTS: Mapping[str, float] = MappingProxyType({})
 
 _KNOWN = (
     (
-        (errno.ENOSPC, errno.EDQUOT),
+        (errno.ENOSPC,),
         "disk_full",
         "the disk of the results is full",
         (
             "Free space or choose another folder with --results, then run the same command again; "
             "the results that were there before are untouched"
+        ),
+    ),
+    (
+        (errno.EDQUOT,),
+        "quota_used_up",
+        "your quota on the disk of the results is used up",
+        (
+            "Free space or choose another folder with --results, then run the same command again; "
+            "the results that were there before are untouched"
+        ),
+    ),
+    (
+        (errno.EFBIG,),
+        "file_limit",
+        "the system stopped a write: the file would exceed its limit on the size of files",
+        (
+            "Raise the limit (ulimit -f unlimited) or choose a folder on another file system with --results, "
+            "then run the same command again; the results that were there before are untouched"
         ),
     ),
     (
@@ -57,12 +75,6 @@ _KNOWN = (
         "Choose another folder with --results, or move the file away",
     ),
     (
-        (errno.EFBIG,),
-        "too_large",
-        TOO_LARGE,
-        "It is not read: look at who wrote it, and remove it",
-    ),
-    (
         (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS),
         "no_locks",
         "the file system of the results has no file locks or links",
@@ -80,11 +92,14 @@ def name_disk_errors(path: Path) -> Iterator[None]:
         path: the file or folder to name where the system's error names none.
 
     Raises:
-        StoreError: ``disk_full``, ``read_only``, ``permission_denied``, ``not_a_folder``, ``no_locks`` or
-            ``disk_error``.
+        StoreError: ``disk_full``, ``quota_used_up``, ``file_limit``, ``read_only``, ``permission_denied``,
+            ``not_a_folder``, ``no_locks``, ``disk_error``, or ``too_large``, a file that is not read.
     """
     try:
         yield
+    except TooLargeError as error:
+        hint = "It is not read: look at who wrote it, and remove it"
+        raise StoreError("too_large", str(error.strerror), where=str(error.filename), hint=hint) from error
     except OSError as error:
         code, what = "disk_error", f"the system reports: {error.strerror or error}"
         hint = "Check the disk and run the same command again; what was there before is untouched"

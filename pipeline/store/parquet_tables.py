@@ -4,13 +4,14 @@ polars drops field metadata when it rewrites a file, so the Arrow schema is buil
 pyarrow writes it. This module is heavy to import; the rest of the room does so only where tables are touched.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from dataframely import FailureInfo
 
@@ -35,6 +36,13 @@ _ZSTD_LEVEL = 3
 _MOST_ROWS_PER_BYTE = 2
 """Of a table's file. The windows of a run ten hours long have 0.22, a clock without anything beside it 0.16:
 what has more was made to fill memory, whatever its manifest says."""
+
+_MOST_BYTES_PER_ROW = 2048
+_SPARE_BYTES = 64 << 20
+"""Of what a table's columns inflate to: a row of the widest contract has 500 bytes, a finding's text 1 kB."""
+
+_WIDTH = 8
+"""Bytes of a number, or of the place of a text."""
 
 _LONGEST_NAME_BYTES = 1 << 20
 _MOST_PARTS = 1 << 20
@@ -108,8 +116,8 @@ def is_of_contract(name: str, version: int, schema: pl.Schema) -> bool:
     return version != find_contract(name).version or schema == schema_of(name)
 
 
-def check_rows(path: Path, rows: int | None) -> None:
-    """Hold the rows that a table's file says it has against its manifest and its size, before any is read.
+def check_size(path: Path, rows: int | None) -> None:
+    """Hold the rows and bytes of a table against its manifest and its file, before any row is handed out.
 
     Args:
         path: the Parquet file.
@@ -142,6 +150,52 @@ def check_rows(path: Path, rows: int | None) -> None:
         raise table_damaged(f"it has {rows_read} rows, its manifest says {rows}", path)
     if rows_read > _MOST_ROWS_PER_BYTE * size:
         raise table_damaged(f"{rows_read} rows cannot stand in {size} bytes", path)
+    most = _SPARE_BYTES + _MOST_BYTES_PER_ROW * rows_read
+    with name_damage(path):
+        inflated = 0
+        for part in _list_inflated(path, about):
+            inflated += part
+            if inflated > most:
+                break
+    if inflated > most:
+        what = (
+            f"its {rows_read} rows inflate to more than {most >> 20} MB, more than any table that slip writes"
+        )
+        raise table_damaged(what, path)
+
+
+def _list_inflated(path: Path, about: pq.FileMetaData) -> Iterator[int]:
+    """Bytes that the columns of a table inflate to: first as its metadata say, then of its texts.
+
+    Pages name a text once, however often it occurs: texts are counted a group of rows at a time, without
+    repeating them in memory.
+    """
+    columns = [about.schema.column(number) for number in range(about.num_columns)]
+    groups = [about.row_group(number) for number in range(about.num_row_groups)]
+    texts = [number for number, column in enumerate(columns) if column.physical_type == "BYTE_ARRAY"]
+    chunks = [(group.column(number), number) for group in groups for number in range(about.num_columns)]
+    yield sum(max(chunk.total_uncompressed_size, _WIDTH * chunk.num_values) for chunk, _ in chunks)
+    # A text is no longer than all pages of its column: most tables need no look at their texts.
+    longest = sum(
+        chunk.total_uncompressed_size * chunk.num_values for chunk, number in chunks if number in texts
+    )
+    if longest <= _SPARE_BYTES:
+        return
+    names = [columns[number].path for number in texts]
+    with pq.ParquetFile(path, read_dictionary=names, pre_buffer=False) as file:
+        for group in range(about.num_row_groups):
+            for name in names:
+                yield sum(map(_measure_texts, file.read_row_group(group, columns=[name]).column(0).chunks))
+
+
+def _measure_texts(array: pa.Array) -> int:
+    """Bytes of the texts of a column, of which nested ones have one leaf."""
+    while pa.types.is_nested(array.type):
+        array = array.field(0) if pa.types.is_struct(array.type) else array.values
+    if pa.types.is_dictionary(array.type):
+        lengths = pc.binary_length(array.dictionary).cast(pa.int64())
+        return int(pc.sum(lengths.take(array.indices)).as_py() or 0)
+    return int(array.nbytes)
 
 
 # Contracts never change while the program runs, and asking one takes as long as checking a small table.

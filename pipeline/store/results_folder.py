@@ -35,7 +35,7 @@ from pipeline.store.names import (
     name_clash,
     name_disk_errors,
 )
-from pipeline.store.parquet_tables import check_rows, check_table, find_contract, schema_of
+from pipeline.store.parquet_tables import check_size, check_table, find_contract, schema_of
 from pipeline.store.verification import DiskFiles, Examination, examine_files
 from schemas import list_contracts
 
@@ -427,11 +427,11 @@ def scan_table(
         entry = manifest.tables.get(table.removeprefix(QUARANTINE))
         if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
             path = manifest.path(table)
-            check_rows(path, manifest.count_rows(table))
+            check_size(path, manifest.count_rows(table))
             (current if entry.contract_version == present else others).append(path)
     pooled = join_inside(root, f"{table}.parquet")
     if pooled.exists():
-        check_rows(pooled, None)
+        check_size(pooled, None)
         others.append(pooled)
     frames = [_fit(pl.scan_parquet(path, glob=False), schema) for path in others]
     if current:

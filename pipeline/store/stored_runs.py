@@ -16,6 +16,7 @@ from pipeline.logs import RemotePath, list_files, locate_recorded, spell_locatio
 from pipeline.store.files import JSON, Manifest, hash_bytes
 from pipeline.store.names import StoreError, encode_run, no_results
 from pipeline.store.results_folder import RUNS, Store
+from pipeline.store.stored_files import SUMMARY
 
 
 def name_plainly(path: Path) -> str:
@@ -162,9 +163,6 @@ def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] 
 
 
 DIAGNOSIS = "diagnosis.json"
-
-
-SUMMARY = "summary.json"
 
 
 def read_choices(manifest: Manifest) -> dict[str, object]:

@@ -1,13 +1,12 @@
 """Are the results still what was written? The same examination for a folder and for an object store."""
 
-import errno
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.core import read_bounded, walk_files
+from pipeline.core import TooLargeError, read_bounded, walk_files
 from pipeline.store.checksums import NOTES, decode_checked, encode_marker, parse_manifest, parse_marker
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_file
 from pipeline.store.generation import LATEST
@@ -161,7 +160,7 @@ class _Examiner:
                 if not problems or self._files.read(name) == data:
                     return problems
             except OSError as error:
-                code = "manifest_damaged" if error.errno == errno.EFBIG else "disk_error"
+                code = "manifest_damaged" if isinstance(error, TooLargeError) else "disk_error"
                 return [self._problem(_folder_of(name), name, code, _format_os_error(error))]
 
     def _judge_run(self, name: str, data: bytes | None) -> list[Problem]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline import results
-from pipeline.core import naming_os_errors, read_bounded, split_interval
+from pipeline.core import naming_os_errors, split_interval
 from pipeline.models import (
     CHANNELS,
     Effect,
@@ -32,7 +32,7 @@ from pipeline.models import (
 )
 from pipeline.results import read_result
 from pipeline.sources import Vehicle
-from pipeline.store import locate_beside, make_folder, replace_file
+from pipeline.store import StoreError, locate_beside, make_folder, read_stored, replace_file
 from pipeline.web import WorkbenchError
 from pipeline.words import describe_end
 
@@ -156,8 +156,8 @@ class SessionFile:
     def read(self) -> Session | None:
         """The stored session; None if there is none, or if it is unreadable."""
         try:
-            return msgspec.json.decode(read_bounded(self.path), type=Session)
-        except (OSError, ValueError, msgspec.DecodeError, RecursionError):
+            return read_stored(self.path, Session)
+        except StoreError:
             return None
 
     def write(self, session: Session) -> None:

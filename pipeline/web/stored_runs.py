@@ -7,7 +7,7 @@ import re
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,10 +27,11 @@ from pipeline.estimation.stored_diagnosis import (
     find_diagnosis,
     keep_diagnosis,
     read_recording,
+    read_stored_diagnosis,
 )
 from pipeline.report.drive_pages import PREVIEW, leave_plan, locate_plan, read_preview
-from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_result
-from pipeline.store import DIAGNOSIS, MANIFEST, UPLOADS, Manifest, Store, hold_lock
+from pipeline.results import RunDiagnosis, find_refusal, read_findings
+from pipeline.store import DIAGNOSIS, MANIFEST, UPLOADS, Manifest, Store, StoreError, hold_lock
 from pipeline.web import Limits, WorkbenchError
 
 _LONGEST = 500
@@ -179,10 +180,10 @@ def read_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
     """The stored diagnosis of a run; None if it has not been diagnosed, or if that cannot be read."""
     if DIAGNOSIS not in manifest.files:
         return find_diagnosis(results, manifest)
-    content = read_json(manifest.path(DIAGNOSIS))
-    with suppress(msgspec.ValidationError):
-        return read_result(content, RunDiagnosis) if content else None
-    return None
+    try:
+        return read_stored_diagnosis(manifest)
+    except StoreError:
+        return None
 
 
 def write_diagnosis(results: Path, manifest: Manifest) -> None:

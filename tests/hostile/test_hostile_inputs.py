@@ -207,7 +207,7 @@ MODELS = [
     ('format = 7\n[vehicle]\npreset = "husky_a200"\n', "1: .*format 7"),
     ("colour = 1\n" + HEAD, "1: .*unknown key"),
     ('[vehicle]\npreset = "nope"\n', "2: .*no vehicle preset is called 'nope'. Write one of: "),
-    ("[vehicle]\nwheel_radius_m = -1\n", "1: .*not valid"),
+    ("[vehicle]\nwheel_radius_m = -1\n", "2: .*not valid"),
     ("format = 1\n", "1: .*no vehicle"),
     ('effects = ["nowhere.py"]\n' + HEAD, "1: .*no such file of effects"),
     ("note = " + "[" * 100_000, "deep"),
@@ -254,8 +254,11 @@ FLEETS = [
 """Files named fleet.toml above a log."""
 
 LIMITS = [
-    ("[parameters]\n", "unknown field `parameters`"),
-    ('[parameter]\n"drive_lag.tau" = {maximum = 1}', "unknown field `maximum`"),
+    ("[parameters]\n", r"unknown key `parameters`\. The keys there are: error, parameter, slip\."),
+    (
+        '[parameter]\n"drive_lag.tau" = {maximum = 1}',
+        r"unknown key `maximum`.*The keys there are: change, max, min\.",
+    ),
     ('[parameter]\n"drive_lag.tau" = {}', "no min, max or change"),
     ('[parameter]\n"drive_lag.tau" = {min = 2, max = 1}', "above its max"),
     ('[parameter]\n"drive_lag.tau" = {change = -0.1}', "not positive"),

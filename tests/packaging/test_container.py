@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -23,12 +24,40 @@ def test_what_the_container_copies_is_there_and_it_starts_slip() -> None:
     copied = [
         word for name, rest in LINES if name == "COPY" and "--from" not in rest for word in rest.split()[:-1]
     ]
-    assert {"pipeline", "schemas", "requirements.txt", "pyproject.toml"} <= set(copied)
+    assert {"pipeline", "schemas", "packaging/requirements-container.txt", "pyproject.toml"} <= set(copied)
     ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").split()
     for name in copied:
         assert (ROOT / name).exists()
         assert f"{name}/" not in ignored
     assert json.loads(dict(LINES)["ENTRYPOINT"]) == ["slip"]  # type: ignore[arg-type]
+
+
+def test_the_base_may_be_given_by_its_digest() -> None:
+    words = dict(reversed(LINES))
+    assert words["ARG"] == "BASE=python:3.11-slim"
+    assert [rest.split()[0] for name, rest in LINES if name == "FROM"] == ["${BASE}", "${BASE}"]
+
+
+def test_the_container_has_what_its_page_advises() -> None:
+    locked = (ROOT / "packaging" / "requirements-container.txt").read_text(encoding="utf-8")
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
+    for extra in ("build", "diagnose", "report", "s3", "serve"):
+        for wanted in extras[extra]:
+            name = re.split(r"[<>=\[]", wanted)[0]
+            assert name == "slip-pipeline" or f"\n{name}==" in f"\n{locked}", name
+
+
+@pytest.mark.parametrize(
+    "name", ["requirements.txt", "requirements-dev.txt", "packaging/requirements-container.txt"]
+)
+def test_a_lock_brings_pip_and_setuptools_up_to_date_and_names_no_host(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    blocks = {block.partition("==")[0]: block for block in re.split(r"\n(?=\S)", text)}
+    for tool in ("pip", "setuptools"):
+        assert "--hash=sha256:" in blocks[tool]
+    assert not re.search(r"https?://|--index|--find-links", text)
 
 
 @pytest.mark.long

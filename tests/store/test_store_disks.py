@@ -2,12 +2,15 @@
 
 import errno
 import os
+import resource
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from store_samples import make_slip, read_seed, write_generation
+from verbs import run_slip
 
 from pipeline.store import Store, StoreError
 
@@ -44,7 +47,13 @@ def catch_refusal(store: Store) -> StoreError | None:
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(errno.ENOSPC, "disk_full"), (errno.EROFS, "read_only"), (errno.EACCES, "permission_denied")],
+    [
+        (errno.ENOSPC, "disk_full"),
+        (errno.EDQUOT, "quota_used_up"),
+        (errno.EFBIG, "file_limit"),
+        (errno.EROFS, "read_only"),
+        (errno.EACCES, "permission_denied"),
+    ],
 )
 def test_refused_at_every_system_call_the_run_is_whole(
     store: Store, monkeypatch: pytest.MonkeyPatch, number: int, code: str
@@ -186,3 +195,36 @@ def test_published_generation_stays_when_its_manifest_cannot_be_looked_at(
     monkeypatch.undo()
     assert store.manifest(RUN) == manifest
     assert manifest.path("summary.json").read_text() == "whole"
+
+
+def test_a_write_that_the_system_stopped_is_told_as_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
+    words = ("analyze", log, "--no-diagnosis", "--results")
+    assert run_slip(*words, tmp_path / "whole")[0] == 0
+    # Python and Numba keep what they compile, and do not notice that it is cut.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (1 << 10, 1 << 13, 60 << 10, 400 << 10):
+        results = tmp_path / str(size)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, usual[1]))
+        try:
+            code, _, err = run_slip(*words, results)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+        last = err.strip().splitlines()[-1]
+        assert code == 1, last
+        assert "the file would exceed its limit on the size of files" in last
+        assert "ulimit -f" in last
+        assert not list(results.rglob("manifest.json"))
+        assert not list(results.rglob(".tmp-*"))
+
+
+def test_a_file_that_is_too_large_to_read_is_told_as_that(store: Store) -> None:
+    path = store.write_results_text("note.txt", "")
+    with path.open("r+b") as file:
+        file.truncate(40 << 20)
+    with pytest.raises(StoreError, match="it has more than 32 MB") as caught:
+        store.edit_results_text("note.txt", str.upper)
+    assert caught.value.code == "too_large"
