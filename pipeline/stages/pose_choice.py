@@ -44,6 +44,8 @@ _ODOMETRY_FRAME: Final = re.compile(r"odom")
 _FROM_WHEELS: Final = 0.02
 """Fraction of the path that wheels do not explain, below which a pose may be computed from them: 4 mm of a
 localization's noise are as much of 0.2 m, the path of half a second at 0.4 m/s."""
+_NEXT: Final = 1.5
+"""Time between two poses over the usual one up to which none is missing between them."""
 _CHANCE: Final = 2.3
 """Twice the relative standard deviation of the median of a single absolute residual: that of n of them is
 smaller by the square root of n."""
@@ -319,11 +321,12 @@ def _compare_with_wheels(
         least = 0.0 if share is None else share * max(0.0, 1.0 - _CHANCE / math.sqrt(distance.size))
     ahead, aside = split_chords(position, yaw)
     aside = aside - np.diff(np.interp(time, path[0], path[2]))
-    turned = ahead * np.diff(yaw)
-    gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
     elapsed = np.maximum(np.diff(time), 1e-3)
-    moving = np.abs(ahead) > _STILL_M
-    sideways = np.abs(aside - gain * turned)[moving] / elapsed[moving]
+    # Where poses are missing a body goes along a curve, of which nothing is known.
+    moving = (np.abs(ahead) > _STILL_M) & (elapsed < _NEXT * float(np.quantile(elapsed, 0.1)))
+    turned, aside, elapsed = (ahead * np.diff(yaw))[moving], aside[moving], elapsed[moving]
+    gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
+    sideways = np.abs(aside - gain * turned) / elapsed
     return share, least, float(np.median(sideways)) if sideways.size else np.inf
 
 
