@@ -6,10 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_drives import DrawnDrive, DrawnTopic, draw_drive, record_cdr, record_twist, stamp_ros, write_drawn
+from drawn_drives import (
+    GEOMETRY,
+    DrawnDrive,
+    DrawnTopic,
+    draw_drive,
+    record_cdr,
+    record_twist,
+    stamp_ros,
+    write_drawn,
+)
 from drawn_motion import draw, sides
 
 from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import Flags, Floats
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.outages import find_outages
@@ -81,6 +91,19 @@ def test_wheel_odometry_is_no_pose_however_little_is_left(name: str, tmp_path: P
     pose = look(tmp_path / "log.mcap", topics).sources.pose
     assert pose is not None
     assert pose.wheels is not None, f"{pose} is taken for a localization"
+
+
+@pytest.mark.parametrize("seconds", [SECONDS, 12.0, 6.0])
+def test_wheel_odometry_that_is_called_a_localization_is_told_after_seconds(
+    seconds: float, tmp_path: Path
+) -> None:
+    of = drive()
+    fields = stamp_ros(of) | of.pose("pose.") | {"header.frame_id": "map"}
+    poses = record_cdr(of, "/slam/pose", "geometry_msgs/msg/PoseStamped", fields)
+    topics = [keep(one, of.time < seconds) for one in (record_twist(of), record_wheels(of), poses)]
+    options = Options(out=tmp_path / "results", report=False, diagnosis=False, overrides=GEOMETRY)
+    found = analyze_log(write_drawn(tmp_path / "log.mcap", *topics), options)
+    assert "wheel odometry, not a localization" in found.refusal
 
 
 def test_a_copy_of_wheel_odometry_is_found_though_of_each_other_messages_are_left(tmp_path: Path) -> None:
