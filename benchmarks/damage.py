@@ -4,6 +4,11 @@ Each byte is changed in three ways: one bit flipped, all bits inverted, and set 
 0x00 already). What is read is compared with the undamaged log: every message with its topic, times and
 fields, and the metadata. It fails where a checksum covers the byte and something else was returned without a
 word.
+
+With --analyses 500 that many damages are made of six recordings in three formats (MCAP, bags of ROS 1, SQLite
+files of rosbag2; three where ../shared is not), and each is analyzed: bits flipped, the end cut off, blocks,
+chunks and messages lost. It fails where slip is neither refused nor that of the same rows of the whole
+recording, within the interval of their median.
 """
 
 from __future__ import annotations
@@ -179,10 +184,16 @@ def _remember(counts: Counter[tuple[str, str, str]], content: bytes, place: int)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--step", type=int, default=1, help="every so many bytes")
     parser.add_argument("--json", type=Path, help="also write the table there")
+    parser.add_argument("--analyses", type=int, default=0, help="analyze so many damaged recordings instead")
+    parser.add_argument("--workers", type=int, default=2, help="processes that analyze")
 
 
 def run(given: argparse.Namespace) -> int:
     """Damage every log, print the table."""
+    if given.analyses:
+        from damaged_analyses import run_analyses  # noqa: PLC0415 - heavy
+
+        return run_analyses(given.analyses, given.workers)
     print(f"{'log':27s} {'covered by':11s} {'pattern':9s}" + "".join(f"{name:>17s}" for name in OUTCOMES))
     rows = []
     silent = 0

@@ -151,6 +151,9 @@ def find_outages(
         columns = command.columns(steps, made.lag, made.delay, crossed=False)
         asked = np.column_stack([blocks.average(one) for one in columns])
     sources = [blocks.spread(one) for one in (moved, asked) if one is not None]
+    if not sources:
+        # Nothing tells when they should turn.
+        return []
     read = {name: _read_side(side, late, blocks, known, sources) for name, side in sides.items()}
     goes_on = None
     if moved is not None and asked is not None:

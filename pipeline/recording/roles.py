@@ -261,10 +261,24 @@ _FEWEST_BLOCKS = 12
 
 
 def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> None:
-    """Tell poses that move otherwise than all that is commanded or measured, as those of another body."""
+    """Tell poses that move otherwise than all that is commanded or measured, as those of another body.
+
+    Of a log of which a part is lost, it is not known whether they do so unless something is seen to drive
+    them: it is told, too.
+    """
     first = _find(drives, case.sources.command)
     made = None if first is None else first.reading.explained
-    if first is None or made is None or first.reading.form != "body" or any(one.is_sure for one in drives):
+    if first is None or any(one.is_sure for one in drives):
+        return
+    if case.extraction.data.losses and first.source.reason != CONFIGURED:
+        text = (
+            "a part of the log is lost, and what is left does not show that the poses of "
+            f"{case.sources.pose} move as {first.source} commands ([command] topic in run.toml takes it all "
+            "the same)"
+        )
+        case.findings.append(Finding("not_driven", "error", text, where="pose"))
+        return
+    if made is None or first.reading.form != "body":
         return
     asked = first.reading.columns(motion.steps, made.lag, made.delay, crossed=False)[0]
     positions = np.append(0.0, np.cumsum(motion.body * np.exp(1j * (np.cumsum(motion.yaw) - motion.yaw))))

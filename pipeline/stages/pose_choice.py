@@ -1,10 +1,15 @@
 """Choice of the pose by its frame and content, and the geometry of an unidentified vehicle.
 
 Every candidate is extracted as in an analysis. Compared are its frame, the rate and coverage of new poses,
-whether it moves at all, and mainly whether it is computed from the wheels: then the path of the wheels
-explains its path, and it never moves sideways.
+whether it moves at all, and mainly whether it is computed from the wheels: then it never moves sideways, and
+the path of the wheels explains its path.
+
+What is not known of a candidate never speaks for it, so that a log of which a part is lost accepts nothing
+that the whole one refuses: a pose that never moves sideways is computed from the wheels unless enough is
+recorded to show another path, and in the frame of an odometry it is so by where it comes from.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +44,11 @@ _ODOMETRY_FRAME: Final = re.compile(r"odom")
 _FROM_WHEELS: Final = 0.02
 """Fraction of the path that wheels do not explain, below which a pose may be computed from them: 4 mm of a
 localization's noise are as much of 0.2 m, the path of half a second at 0.4 m/s."""
+_NEXT: Final = 1.5
+"""Time between two poses over the usual one up to which none is missing between them."""
+_CHANCE: Final = 2.3
+"""Twice the relative standard deviation of the median of a single absolute residual: that of n of them is
+smaller by the square root of n."""
 _SIDEWAYS_MPS: Final = 2e-3
 """Sideways speed [m/s] below which a pose may be computed from the wheels: a localization has more noise."""
 _ASTRAY: Final = 0.3
@@ -70,7 +80,8 @@ class PoseRating:
         reason: as text.
         refusal: why it is unusable; empty if it is usable.
         stands: whether it is unusable since it never changes.
-        position: its positions [m], shape (n, 2), until copies are found.
+        time: of its positions [s], shape (n,), until copies are found.
+        position: its positions [m], shape (n, 2), as long.
         same_as: a topic with the same positions, wheel odometry or the best candidate; empty without one.
     """
 
@@ -85,6 +96,7 @@ class PoseRating:
     reason: str = ""
     refusal: str = ""
     stands: bool = False
+    time: Floats | None = None
     position: Floats | None = None
     same_as: str = ""
 
@@ -116,7 +128,7 @@ def rate_poses(given: Given) -> tuple[PoseRating, ...]:
     for number, one in enumerate(rated[1:], start=1):
         if not best.from_wheels and one.source.topic in driven and _are_copies(best, one):
             rated[number] = replace(one, same_as=str(best.source))
-    return tuple(replace(one, position=None) for one in rated)
+    return tuple(replace(one, time=None, position=None) for one in rated)
 
 
 _COPIED: Final = 0.9
@@ -136,14 +148,19 @@ def _find_copy(rating: PoseRating, ratings: Sequence[PoseRating]) -> PoseRating:
 
 
 def _are_copies(one: PoseRating, other: PoseRating) -> bool:
-    """Whether another candidate has the positions of one; none of one that is refused."""
-    own = _round_positions(one)
-    return len(own & _round_positions(other)) > _COPIED * len(own)
+    """Whether another candidate has the positions of one, to a micrometre; none is one that is refused.
 
-
-def _round_positions(rating: PoseRating) -> set[tuple[float, ...]]:
-    """Positions of a candidate to a micrometre; none of one that is refused."""
-    return set() if rating.position is None else {*map(tuple, np.round(rating.position, 6).tolist())}
+    Where both have poses of the same times, these are compared: of two topics of a damaged log different
+    messages are left.
+    """
+    if one.time is None or one.position is None or other.time is None or other.position is None:
+        return False
+    position, there = one.position, other.position
+    shared = np.isin(np.round(one.time, 6), np.round(other.time, 6))
+    if shared.sum() >= FEWEST_MESSAGES:
+        position = position[shared]
+    own, others = ({*map(tuple, np.round(some, 6).tolist())} for some in (position, there))
+    return len(own & others) > _COPIED * len(own)
 
 
 def _rate(given: Given, pose: PoseSource) -> PoseRating:
@@ -174,12 +191,13 @@ def _rate(given: Given, pose: PoseSource) -> PoseRating:
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
         refusal = f"its position never changes while {living}"
         return replace(bare, rate_hz=rate, refusal=refusal, stands=True)
-    share, sideways = _compare_with_wheels(time, position, yaw, path)
-    from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
+    share, least, sideways = _compare_with_wheels(time, position, yaw, path)
     # Satellite poses do not depend on the wheels, and a heading from the course shows no sideways motion.
     on_course = any(finding.id == "no_heading" for finding in made.findings)
-    from_wheels = from_wheels and not on_course and pose.content is PoseContent.POSE
-    if pose.content is PoseContent.POSE and not on_course:
+    is_plain = pose.content is PoseContent.POSE and not on_course
+    is_apart = path is None or (least >= _FROM_WHEELS and not _is_odometry(pose, parent))
+    from_wheels = is_plain and sideways < _SIDEWAYS_MPS and not is_apart
+    if is_plain:
         score, reasons = _score_frame(str(pose), parent)
     else:
         score, reasons = _score_satellites(pose, time, position, made.findings)
@@ -206,12 +224,20 @@ def _rate(given: Given, pose: PoseSource) -> PoseRating:
         from_wheels=from_wheels,
         score=score,
         reason=", ".join(reasons),
+        time=time,
         position=position,
     )
 
 
 def _span_of(table: pl.DataFrame) -> float:
     return float(np.ptp(table["t"].to_numpy())) if table.height else 0.0
+
+
+def _is_odometry(pose: PoseSource, parent: str) -> bool:
+    """Whether a pose is given in the frame of an odometry, by a topic whose name says no localization."""
+    frame = parent.lower()
+    is_fixed = _FIXED_FRAME.search(frame) is not None or is_localization(str(pose).lower())
+    return not is_fixed and _ODOMETRY_FRAME.search(frame) is not None
 
 
 def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
@@ -270,31 +296,38 @@ def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Fl
 
 def _compare_with_wheels(
     time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats, Floats] | None
-) -> tuple[float | None, float]:
-    """Fraction of a pose's path not explained by the wheels, and its median relative sideways speed [m/s].
+) -> tuple[float | None, float, float]:
+    """How far a pose goes another way than the wheels.
 
     Any gain is allowed, and a small delay. Coarse integration of a turn causes an apparent sideways motion
     proportional to path times turn, which is removed.
+
+    Returns:
+        Fraction of its path not explained by the wheels, None where too little is recorded; the least that it
+        may be but for chance, infinite without wheels; and median relative sideways speed [m/s], infinite
+        where it stands.
     """
     if path is None:
-        return None, np.inf
+        return None, np.inf, np.inf
     inside = (time >= path[0][0]) & (time <= path[0][-1])
-    time, position, yaw = time[inside], position[inside], yaw[inside]
-    if time.size < FEWEST_MESSAGES:
-        return None, np.inf
-    ends = np.arange(0, time.size, arrays.count_steps(time, SPAN_S))
-    distance, _ = split_chords(position[ends], yaw[ends])
-    rolled = np.interp(time[ends], *path[:2])
-    rate = np.gradient(path[1], arrays.spread_equal(path[0]))
-    share = measure_rest(distance, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
+    share, least = None, 0.0
+    if inside.sum() >= FEWEST_MESSAGES:
+        time, position, yaw = time[inside], position[inside], yaw[inside]
+        ends = np.arange(0, time.size, arrays.count_steps(time, SPAN_S))
+        distance, _ = split_chords(position[ends], yaw[ends])
+        rolled = np.interp(time[ends], *path[:2])
+        rate = np.gradient(path[1], arrays.spread_equal(path[0]))
+        share = measure_rest(distance, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
+        least = 0.0 if share is None else share * max(0.0, 1.0 - _CHANCE / math.sqrt(distance.size))
     ahead, aside = split_chords(position, yaw)
     aside = aside - np.diff(np.interp(time, path[0], path[2]))
-    turned = ahead * np.diff(yaw)
-    gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
     elapsed = np.maximum(np.diff(time), 1e-3)
-    moving = np.abs(ahead) > _STILL_M
-    sideways = np.abs(aside - gain * turned)[moving] / elapsed[moving]
-    return share, float(np.median(sideways)) if sideways.size else np.inf
+    # Where poses are missing a body goes along a curve, of which nothing is known.
+    moving = (np.abs(ahead) > _STILL_M) & (elapsed < _NEXT * float(np.quantile(elapsed, 0.1)))
+    turned, aside, elapsed = (ahead * np.diff(yaw))[moving], aside[moving], elapsed[moving]
+    gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
+    sideways = np.abs(aside - gain * turned) / elapsed
+    return share, least, float(np.median(sideways)) if sideways.size else np.inf
 
 
 def yaw_of(quaternion: Floats) -> Floats:

@@ -161,8 +161,11 @@ def gather_samples(
     )
 
 
-_FEWEST_SPANS = 20
-"""Least number of half seconds in which poses are compared with wheels: ten seconds of driving."""
+_FEWEST_SPANS = 8
+"""Least number of half seconds in which poses are compared with wheels: four seconds of driving: no more may
+be left of a damaged log."""
+_FEWEST_MOVING = 50
+"""Least number of samples in motion for that comparison."""
 _SIDEWAYS = 1e-4
 """Sideways speed of a wheel odometry [m/s]: rounding. `pose_choice` tolerates 20 times as much, since it only
 ranks candidates."""
@@ -201,7 +204,7 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     first, last = list_spans(samples, known)
     moving = known & (np.abs(np.nan_to_num(samples.measured)) > STILL_MPS).any(axis=1)
     is_driven = vehicle.kinematics.has_inputs("sideways")
-    if min(int(moving.sum()) - FEWEST_SAMPLES, first.size - _FEWEST_SPANS) < 0:
+    if moving.sum() < _FEWEST_MOVING or first.size < _FEWEST_SPANS:
         return []
     sideways = samples.velocity[:, 1] - samples.measured[:, 1]
     keeps_straight = not is_driven and float(np.median(np.abs(sideways[moving]))) <= _SIDEWAYS

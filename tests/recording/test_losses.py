@@ -142,3 +142,18 @@ def test_of_two_robots_the_one_is_taken_that_the_commands_drive(tmp_path: Path) 
 def test_poses_that_no_command_drives_are_told(tmp_path: Path) -> None:
     _, told = set_up(tmp_path / "log.mcap", make_robot(7).command(), make_robot(8).pose())
     assert "not as /cmd_vel commands" in told["not_driven"]
+
+
+@pytest.mark.parametrize("number", [7, 8])
+def test_of_a_damaged_log_poses_are_used_only_where_they_are_seen_to_be_driven(
+    number: int, tmp_path: Path
+) -> None:
+    """The rest of the log might show that they are of another body, as that of the whole log does."""
+    begun = [
+        replace(one, times=one.times[:90]) for one in (make_robot(7).command(), make_robot(number).pose())
+    ]
+    whole = write_drawn(tmp_path / "log.mcap", *(replace(one, messages=one.messages[:90]) for one in begun))
+    part = tmp_path / "part.mcap"
+    part.write_bytes(whole.read_bytes()[:-40])
+    findings = {one.id for one in set_up_log(part, Options(out=tmp_path)).choice.findings}
+    assert ("not_driven" in findings) is (number == 8)
