@@ -62,7 +62,6 @@ _YOUNG = 20_000
 _MOVED = {
     **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
     **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
-    "schedule": "batch",
 }
 """Former top-level commands, and the command that each belongs to now."""
 

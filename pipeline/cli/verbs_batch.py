@@ -1,15 +1,14 @@
-"""The batch: the logs of a folder, what is new afterwards, and recipes that run it every night."""
+"""The batch: the logs of a folder, and what is new afterwards."""
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pipeline.batch import (
@@ -20,7 +19,6 @@ from pipeline.batch import (
     parse_shard,
     parse_size,
 )
-from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
     CLEAN,
     EXPLAINED,
@@ -37,7 +35,7 @@ from pipeline.cli.conventions import (
     print_lines,
     summarize_error,
 )
-from pipeline.core import SlipError, measure_memory, slip_command
+from pipeline.core import SlipError, measure_memory
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Line, Outcome
@@ -46,16 +44,7 @@ if TYPE_CHECKING:
 _MEMORY_SHARE = 0.8
 
 
-def build_batch() -> App:
-    """The command, which brings results up to date by itself, and its own commands."""
-    app = App(name="batch", help="Analyze the new and changed logs of a folder.")
-    app.default(run)
-    app.command(run)
-    app.command(schedule)
-    return app
-
-
-def run(  # noqa: D417 - the shared choices document themselves
+def batch(  # noqa: D417 - the shared choices document themselves
     logs: Annotated[
         list[str] | None,
         Parameter(help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash"),
@@ -205,45 +194,3 @@ def _list_notes(line: Line) -> list[str]:
     """State of a log, and notes on results that did not change."""
     notes = {"refused": line.refused, "lossy": line.lossy}
     return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]
-
-
-def schedule(  # noqa: D417 - arguments document themselves
-    *arguments: Annotated[
-        str, Parameter(help="what follows `slip batch`: logs and options", allow_leading_hyphen=True)
-    ],
-    print: Annotated[System, Parameter(name="--print")] = "systemd",  # noqa: A002 - the promised name
-    at: Annotated[str, Parameter(name="--at")] = "02:00",
-    lock: Annotated[Path | None, Parameter(name="--lock")] = None,
-    notify: Annotated[str | None, Parameter(name="--notify")] = None,
-) -> int:
-    """Print a recipe that runs `slip batch` every night.
-
-    Runs never overlap. With systemd and cron, nights that the machine slept through are made up for, and the
-    journal has what was printed.
-
-    Args:
-        print: systemd (a service and its timer), cron, airflow (a DAG) or github (a workflow of its Actions).
-        at: time of day; local for systemd and cron, UTC for the others.
-        notify: command line for the shell that gets new failures.
-        lock: lock file (default: .slip-batch.lock in this folder).
-    """
-    hour, minute = parse_clock(at)
-    # A misspelt option would fail every night, where nobody looks.
-    try:
-        build_batch().parse_args(list(arguments), exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        why = str(error).strip().partition(". ")[0].rstrip(".")
-        what = f"slip batch does not take what would be run every night: {why}"
-        raise SlipError("usage", what, hint="It takes the folders and options of `slip batch`.") from error
-    folder = Path.cwd()
-    nightly = Nightly(
-        program=slip_command(),
-        arguments=arguments,
-        folder=folder,
-        lock=(folder / (lock or ".slip-batch.lock")),
-        hour=hour,
-        minute=minute,
-        notify=notify,
-    )
-    sys.stdout.write(print_units(nightly, print))
-    return CLEAN

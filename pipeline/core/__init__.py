@@ -64,7 +64,6 @@ if TYPE_CHECKING:
         read_version,
         require_package,
         silence_warnings,
-        slip_command,
     )
     from pipeline.core.rigid import (
         GRAVITY_MPS2,

@@ -10,7 +10,6 @@ from cyclopts import App
 from verbs import run_program, run_verb
 
 from pipeline.cli import build_app
-from pipeline.simulate import simulate_case
 
 MOVED = {
     "predict": "fleet predict",
@@ -22,7 +21,6 @@ MOVED = {
     "explain": "results explain",
     "query": "results query",
     "stage": "results stage",
-    "schedule": "batch schedule",
 }
 
 
@@ -56,7 +54,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
     options = {words: list_options(app) for words, app in list_apps(build_app())}
     without = {words for words, names in options.items() if names and "--results" not in names}
     assert without == {
-        "batch schedule", "effects", "fleet map merge", "model new", "model new-effect",
+        "effects", "fleet map merge", "model new", "model new-effect",
         "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
     }  # fmt: skip
     for names in options.values():
@@ -85,15 +83,6 @@ def test_out_is_still_understood_as_what_it_was_called_before(tmp_path: Path) ->
     assert "--out" not in run_verb("analyze", "--help").stdout
     # What follows -- is a name, whatever it is.
     assert "--out: " in run_verb("analyze", "--", "--out").stderr
-
-
-def test_a_batch_has_its_verb_and_does_without(tmp_path: Path) -> None:
-    simulate_case("husky_tile", out=tmp_path / "logs" / "a.mcap", duration_s=20.0)
-    first = run_verb("batch", "logs", "--settle", 0, "--json", cwd=tmp_path)
-    again = run_verb("batch", "run", "logs", "--settle", 0, "--json", cwd=tmp_path)
-    assert (first.returncode, again.returncode) == (0, 0)
-    assert json.loads(first.stdout)["done"] == json.loads(again.stdout)["unchanged"] == 1
-    assert "batch run logs" in run_verb("batch", "schedule", "logs", cwd=tmp_path).stdout
 
 
 def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
