@@ -15,7 +15,6 @@ from pipeline.store import (
     DiskFiles,
     Examination,
     Manifest,
-    Mirror,
     Problem,
     Sample,
     Store,
@@ -46,30 +45,26 @@ class Repair:
 
 
 def repair_results(
-    store: Store, examination: Examination, mirror: Mirror | None = None, *, follow_remote: bool = False
+    store: Store, examination: Examination, *, follow_remote: bool = False
 ) -> tuple[Repair, ...]:
     """Schedule or perform all possible repairs; no usable result is removed.
 
     Args:
         store: the results.
         examination: problems of the results.
-        mirror: the mirror of the store, if the results are on an object store.
         follow_remote: whether to look for logs at addresses that the results contain.
 
     Raises:
         StoreError: the results cannot be written.
     """
-    return tuple(_Repairer(store, examination, mirror, follow_remote=follow_remote).repair())
+    return tuple(_Repairer(store, examination, follow_remote=follow_remote).repair())
 
 
 class _Repairer:
-    def __init__(
-        self, store: Store, examination: Examination, mirror: Mirror | None, *, follow_remote: bool
-    ) -> None:
+    def __init__(self, store: Store, examination: Examination, *, follow_remote: bool) -> None:
         self._store = store
         self._follow_remote = follow_remote
-        self._target = mirror or store
-        self._files = mirror or DiskFiles(store.root)
+        self._files = DiskFiles(store.root)
         self._examination = examination
         entries = Ledger(store).read_all().values()
         self._logs: Mapping[str, str] = {
@@ -89,7 +84,7 @@ class _Repairer:
         name = problem.path.relative_to(self._store.root).as_posix()
         if problem.code == "left_out":
             return Repair(subject=name, action="left", what="find out who made it, and remove it")
-        self._target.remove(name)
+        self._store.remove(name)
         forget_pools(self._store)
         return Repair(subject=name, action="removed", what="no result is lost")
 
@@ -114,7 +109,7 @@ class _Repairer:
         manifest = self._read_manifest(home)
         if codes & set(_UNREADABLE):
             # No reader can use it, and no writer can replace it.
-            self._target.remove(f"{home}/{MANIFEST}")
+            self._store.remove(f"{home}/{MANIFEST}")
         elif manifest is not None:
             self._store.ask_again(manifest)
 
@@ -205,7 +200,6 @@ def verify_results(
     *,
     logs: bool,
     notify: Callable[[str], None],
-    mirror: Mirror | None = None,
     repair: bool = False,
     follow_remote: bool = False,
     sample: Sample | None = None,
@@ -216,7 +210,6 @@ def verify_results(
         store: the results.
         logs: whether to read the logs, which takes as long as reading them from disk.
         notify: called with the name of each run before its log is read.
-        mirror: the mirror of the store, if the results are on an object store.
         repair: whether to repair what can be repaired.
         follow_remote: whether to look for logs at addresses that the results contain.
         sample: sample of the files and logs to read; None for all.
@@ -224,8 +217,8 @@ def verify_results(
     Raises:
         StoreError: the results cannot be written.
     """
-    examination = (mirror or store).examine(sample)
-    repairs = repair_results(store, examination, mirror, follow_remote=follow_remote) if repair else ()
+    examination = store.examine(sample)
+    repairs = repair_results(store, examination, follow_remote=follow_remote) if repair else ()
     manifests = store.survey().manifests
     problems: list[LogProblem] = []
     tally = Tally()

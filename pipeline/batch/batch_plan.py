@@ -22,7 +22,6 @@ from pipeline.store import (
     LogIdentities,
     LogSighting,
     Manifest,
-    Mirror,
     Store,
     StoreError,
     hash_json,
@@ -366,28 +365,6 @@ def refresh_pools(store: Store) -> bool:
 def forget_pools(store: Store) -> None:
     """Invalidate the tables and pages over all runs, so that the next batch makes them again."""
     store.notes(_NOTES).remove(_NOTE)
-
-
-def refresh_remote_pools(mirror: Mirror) -> None:
-    """As `refresh_pools`, for results on an object store, including runs added by other machines.
-
-    A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
-    catalogue links them.
-    """
-    from pipeline.datasets import FLEET, TREND  # noqa: PLC0415 - heavy
-    from pipeline.report import PAGES  # noqa: PLC0415 - heavy
-
-    mirror.pull_index()
-    tables = ["aggregates"]
-    if (mirror.store.root / FLEET).is_file():
-        tables += ["findings", "estimates"]
-    if (mirror.store.root / TREND).is_file():
-        tables += ["slip", "findings", "estimates"]
-    mirror.pull_tables(tables, mirror.store.manifests())
-    forget_pools(mirror.store)
-    refresh_pools(mirror.store)
-    for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
-        mirror.push_file(mirror.store.root / name)
 
 
 def _hash_runs(store: Store) -> str:

@@ -18,7 +18,6 @@ from pipeline.batch.batch_plan import (
     make_plan,
     prune_results,
     refresh_pools,
-    refresh_remote_pools,
 )
 from pipeline.batch.batch_work import (
     FATAL_KILLS,
@@ -37,7 +36,7 @@ from pipeline.batch.batch_work import (
 from pipeline.batch.executors import SCHEMES, LocalExecutor, open_cluster
 from pipeline.batch.recordings import find_recordings
 from pipeline.core import SlipError
-from pipeline.store import Mirror, Store
+from pipeline.store import Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that would affect every other log as well."""
@@ -126,7 +125,6 @@ class _Run:
             log=item.log,
             fingerprint=item.fingerprint,
             options=replace(self._request.options, run=item.run),
-            address=self._request.address,
         )
 
     def _land(self, future: Future[Report], item: Item) -> None:
@@ -211,7 +209,6 @@ class Line:
         peak_bytes: peak memory of its worker.
         rss_bytes: memory of its worker afterwards.
         size_bytes: size of the log.
-        fetched_bytes: bytes fetched from an object store for it.
     """
 
     path: str
@@ -226,7 +223,6 @@ class Line:
     peak_bytes: int = 0
     rss_bytes: int = 0
     size_bytes: int = 0
-    fetched_bytes: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,13 +271,10 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         StoreError: the results cannot be written at all.
     """
     started = time.monotonic()
-    mirror = None if request.address is None else Mirror(request.address, request.options.out)
     store = Store(request.options.out)
-    if mirror is not None:
-        mirror.pull_index()
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    ledger = Ledger(store, mirror)
+    ledger = Ledger(store)
     workforce = _Workforce(request, work, most=len(listed.recordings))
     try:
         new = _count_new(listed.recordings, ledger, request.shard)
@@ -293,7 +286,7 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         result = _work_through(todo, request, ledger, watch, workforce)
     finally:
         workforce.dismiss()
-    problems, removed = _tidy_up(store, mirror, request)
+    problems, removed = _tidy_up(store, request)
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     growing = [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
     skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]
@@ -308,18 +301,15 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     )
 
 
-def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tuple[SlipError, ...], int]:
+def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int]:
     """Pool the runs and remove old generations; errors are returned, so that they do not hide the outcome."""
     problems: list[SlipError] = []
     removed = 0
     try:
-        if mirror is None:
-            refresh_pools(store)
-        else:
-            refresh_remote_pools(mirror)
+        refresh_pools(store)
         if request.pruning is not None:
             pruned = prune_results(store, request.pruning)
-            removed = len(pruned.removed) if mirror is None else mirror.prune(pruned.removed)
+            removed = len(pruned.removed)
             problems += pruned.problems
     except SlipError as error:
         problems.append(error)
@@ -435,5 +425,5 @@ def _make_line_of(entry: Entry, state: str, report: Report | None = None) -> Lin
     )
     if report is None:
         return line
-    cost = {name: getattr(entry, name) for name in ("seconds", "fetched_bytes", "peak_bytes")}
+    cost = {name: getattr(entry, name) for name in ("seconds", "peak_bytes")}
     return replace(line, rss_bytes=report.rss_bytes, **cost)

@@ -12,7 +12,6 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -22,8 +21,7 @@ import msgspec
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
 from pipeline.core import SlipError, end_with, limit_memory, objects_in, read_memory, silence_warnings
-from pipeline.logs import FETCHED
-from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Mirror, Store, StoreError, stored_contexts
+from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Store, stored_contexts
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #
@@ -55,7 +53,6 @@ class Entry:
         has_report: whether the generation contains a report.
         seconds: processing time.
         peak_bytes: peak memory of its worker.
-        fetched_bytes: bytes fetched from an object store for it.
         at: time of the processing [s since 1970].
     """
 
@@ -71,7 +68,6 @@ class Entry:
     has_report: bool = False
     seconds: float = 0.0
     peak_bytes: int = 0
-    fetched_bytes: int = 0
     at: float = field(default=0.0)
 
     def fits(self, log: LogSighting, fingerprint: str) -> bool:
@@ -84,11 +80,9 @@ class Ledger:
 
     Args:
         store: the results.
-        mirror: where entries are published, if the results are on an object store.
     """
 
-    def __init__(self, store: Store, mirror: Mirror | None = None) -> None:
-        self._mirror = mirror
+    def __init__(self, store: Store) -> None:
         self._notes = store.notes(LOG_NOTES)
 
     def read_all(self) -> Mapping[str, Entry]:
@@ -110,10 +104,6 @@ class Ledger:
         stamped = replace(entry, at=round(time.time(), 3))
         content: dict[str, JSON] = msgspec.to_builtins(stamped)
         self._notes.write(entry.log.path, content)
-        if self._mirror is not None:
-            # A lost entry costs one reading of the log.
-            with suppress(StoreError):
-                self._mirror.push_file(self._notes.path_of(entry.log.path))
 
 
 def _as_entry(content: Mapping[str, JSON]) -> Entry | None:
@@ -133,14 +123,12 @@ class Task:
         log: state of its file when the batch was planned.
         fingerprint: hash of everything else the results depend on.
         options: options of the analysis, including the name of its run.
-        address: address of the results, if they are on an object store.
     """
 
     path: Path
     log: LogSighting
     fingerprint: str
     options: Options
-    address: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,16 +168,15 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
 
 def work_on(task: Task) -> Report:
     """Analyze one log and record the outcome in the ledger; no log can make it raise."""
-    mirror = None if task.address is None else Mirror(task.address, task.options.out)
     store = Store(task.options.out)
-    started, fetched = time.monotonic(), FETCHED.total
+    started = time.monotonic()
     entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.options.run or "")
     is_new = False
     try:
         with store.claim(entry.run) as is_ours:
             if not is_ours:
                 return Report(entry=entry, is_busy=True)
-            entry, is_new = _analyze(task, entry, mirror)
+            entry, is_new = _analyze(task, entry)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
@@ -199,17 +186,12 @@ def work_on(task: Task) -> Report:
         entry,
         seconds=round(time.monotonic() - started, 3),
         peak_bytes=_peak_bytes(),
-        fetched_bytes=FETCHED.total - fetched,
     )
-    Ledger(store, mirror).write(entry)
+    Ledger(store).write(entry)
     return Report(entry=entry, is_new=is_new, rss_bytes=read_memory(os.getpid()))
 
 
-def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
-    # Workers without any work need no table library.
-
-    if mirror is not None:
-        mirror.pull_run(entry.run)
+def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool]:
     before = Store(task.options.out).manifest(entry.run) if entry.run else None
     try:
         outcome = analyze_log(task.path, task.options)
@@ -218,8 +200,6 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
             raise
         # An object that was overwritten during reading is probably complete now.
         outcome = analyze_log(task.path, task.options)
-    if mirror is not None:
-        mirror.push_run(outcome.manifest)
     done = replace(
         entry,
         state="refused" if outcome.refusal else "lossy" if outcome.lossy else "done",

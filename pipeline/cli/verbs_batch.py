@@ -101,14 +101,12 @@ def batch(  # noqa: D417 - the shared choices document themselves
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
-    opened = open_results(choices.results)
     if not logs:
-        opened.open_store()
+        open_results(choices.results)
     workers = jobs or count_cores()
     request = Request(
         targets=tuple(logs or ()),
-        options=replace(options, out=opened.root, config=None, fleet=options.config),
-        address=None if opened.mirror is None else opened.mirror.address,
+        options=replace(options, config=None, fleet=options.config),
         executor=executor,
         jobs=workers,
         shard=None if shard is None else parse_shard(shard),
@@ -130,11 +128,11 @@ def batch(  # noqa: D417 - the shared choices document themselves
         if notify is not None:
             from pipeline.batch.notices import note_error, send_news  # noqa: PLC0415 - heavy
 
-            send_news(opened.root, notify, [note_error(error)], [], code=FAILED)
+            send_news(choices.results, notify, [note_error(error)], [], code=FAILED)
         raise
     lines = format_outcome(outcome, is_search=bool(logs))
     code = FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
-    news, problems = ((), ()) if notify is None else _tell(outcome, opened.root, notify, lines, code)
+    news, problems = ((), ()) if notify is None else _tell(outcome, choices.results, notify, lines, code)
     for problem in (*outcome.problems, *problems):
         print_error(problem)
     if json:
@@ -177,10 +175,6 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     states = Counter(line.state for line in outcome.lines)
     rare = {state: states[state] for state in ("growing", "left", "skipped") if states[state]}
     lines = format_counts({**outcome.counts, **rare}, width=6)
-    fetched = sum(line.fetched_bytes for line in outcome.lines)
-    if fetched:
-        whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
-        lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     noted = [(_list_notes(line), (line.path, line.reason, line.hint)) for line in outcome.lines]

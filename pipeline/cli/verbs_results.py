@@ -79,12 +79,7 @@ def query(  # noqa: D417 - arguments document themselves
     from pipeline.store import Partition  # noqa: PLC0415 - heavy
 
     partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
-    opened = open_results(results)
-    store = opened.open_store()
-    if opened.mirror is not None:
-        words = re.findall(r"\w+", sql.lower())
-        opened.mirror.pull_tables(words, partition.select(store.manifests()))
-    answer = store.query(sql, partition)
+    answer = open_results(results).query(sql, partition)
     if as_json or to == "json":
         _print_json(answer)
     elif to == "csv":
@@ -161,7 +156,7 @@ def status(  # noqa: D417 - arguments document themselves
     """
     from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
 
-    status_now = read_status(open_results(results).open_store())
+    status_now = read_status(open_results(results))
     print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
     return FAILED if status_now.errors else CLEAN
 
@@ -227,12 +222,10 @@ def verify(  # noqa: D417 - arguments document themselves
     from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
 
     drawn = parse_sample(sample, seed)
-    opened = open_results(results)
-    store = opened.open_store()
+    store = open_results(results)
     with show_progress("verify", quiet=quiet or json) as notify:
         verification = verify_results(
             store,
-            mirror=opened.mirror,
             logs=logs,
             notify=notify,
             repair=repair,

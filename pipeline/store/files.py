@@ -353,7 +353,7 @@ class Manifest:
         """What `read` raises of the first table whose file is of another size; nothing is read.
 
         Args:
-            needed: tables whose files may not be missing either; a mirror has only those that were asked for.
+            needed: tables whose files may not be missing either.
         """
         for name, entry in self.tables.items():
             path = self.folder / entry.file
