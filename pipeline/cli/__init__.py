@@ -61,7 +61,7 @@ _YOUNG = 20_000
 """Threshold of the garbage collector [new objects]: nearly all are freed without it, and it takes time."""
 _MOVED = {
     **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
-    **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
+    **dict.fromkeys(("status", "verify", "query", "stage"), "results"),
 }
 """Former top-level commands, and the command that each belongs to now."""
 

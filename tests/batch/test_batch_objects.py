@@ -136,7 +136,7 @@ def test_a_store_without_credentials_or_out_of_reach_is_said_in_one_line(
     [
         ("analyze", "a.mcap", "--results"),
         ("batch", "logs", "--results"),
-        ("results", "status"),
+        ("results", "status", "--results"),
         ("results", "query", "SELECT 1", "--results"),
     ],
 )

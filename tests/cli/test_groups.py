@@ -18,7 +18,6 @@ MOVED = {
     "share": "fleet share",
     "status": "results status",
     "verify": "results verify",
-    "explain": "results explain",
     "query": "results query",
     "stage": "results stage",
 }

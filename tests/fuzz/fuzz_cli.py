@@ -279,10 +279,10 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
             folder / "results" / "runs"
         )
         verbs = [
-            ["results", "status", "results"],
+            ["results", "status", "--results", "results"],
             ["results", "verify", "results"],
             ["results", "query", rng.choice(QUERIES), "--out", "results"],
-            ["results", "explain", str(run), "--out", "results"],
+            ["results", "status", str(run), "--out", "results"],
             [
                 "export",
                 str(run),
