@@ -234,12 +234,14 @@ class Outcome:
         seconds: duration.
         problems: problems other than with logs: of the tables over all runs, or of pruning.
         removed: number of old generations removed.
+        notified: what the command of the user was told.
     """
 
     lines: tuple[Line, ...]
     seconds: float
     problems: tuple[SlipError, ...] = ()
     removed: int = 0
+    notified: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,7 +38,6 @@ from pipeline.core import SlipError, measure_memory
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Line, Outcome
-    from pipeline.batch.notices import Notice
 
 _MEMORY_SHARE = 0.8
 
@@ -88,8 +86,8 @@ def batch(  # noqa: D417 - the shared choices document themselves
         prune: remove old generations afterwards; without logs, only that.
         keep: old generations to keep of each run.
         quota: with --prune, size of the results above which the oldest go first, for example 200GB.
-        notify: command line for the shell that gets new failures: the message on its standard input, and
-            $SLIP_SUBJECT, $SLIP_JSON.
+        notify: command line for the shell that gets the JSON object on its standard input when something is
+            new: a log that failed, had losses or cannot show slip, or another error.
         json: print one JSON object.
         quiet: print nothing but errors.
     """
@@ -118,46 +116,44 @@ def batch(  # noqa: D417 - the shared choices document themselves
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,
     )
-    from pipeline.batch.batch_run import run_batch  # noqa: PLC0415 - heavy
+    from pipeline.batch.batch_run import Outcome, run_batch  # noqa: PLC0415 - heavy
 
     try:
         with open_watch(quiet=quiet or json) as watch:
             outcome = run_batch(request, watch)
     except Exception as error:
         # No logs, a full disk: nobody looks at the screen of a night.
-        if notify is not None:
-            from pipeline.batch.notices import note_error, send_news  # noqa: PLC0415 - heavy
-
-            send_news(choices.results, notify, [note_error(error)], [], code=FAILED)
+        what = error if isinstance(error, SlipError) else SlipError("unexpected_error", repr(error), hint="")
+        _tell(Outcome(lines=(), seconds=0.0, problems=(what,)), choices.results, notify)
         raise
-    lines = format_outcome(outcome, is_search=bool(logs))
-    code = FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
-    news, problems = ((), ()) if notify is None else _tell(outcome, choices.results, notify, lines, code)
-    for problem in (*outcome.problems, *problems):
+    for problem in outcome.problems:
         print_error(problem)
+    outcome = _tell(outcome, choices.results, notify)
     if json:
-        print_json(_as_json(outcome, news, problems))
+        print_json(_as_json(outcome))
     elif not quiet:
-        print_lines(lines)
-    return FAILED if problems else code
+        print_lines(format_outcome(outcome, is_search=bool(logs)))
+    return FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
 
 
-def _tell(
-    outcome: Outcome, root: Path, notify: str, lines: Sequence[str], code: int
-) -> tuple[Sequence[Notice], Sequence[SlipError]]:
-    """Send the news of a batch: what was sent, and why it was not."""
+def _tell(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
+    """The outcome with what is new in it, which the command of ``--notify`` was given, or why it was not."""
     from pipeline.batch import notices  # noqa: PLC0415 - heavy
 
+    if notify is None:
+        return outcome
+    news = notices.find_news(root, outcome)
+    told = replace(outcome, notified=tuple(news.values()))
     try:
-        # The counts alone: the notices say which logs failed.
-        counts = lines[: lines.index("")] if "" in lines else lines
-        report = [*counts, "", f"page    {root.absolute() / 'index.html'}"]
-        return notices.send_news(root, notify, notices.list_failures(outcome), report, code=code), ()
+        if news:
+            notices.tell(root, notify, _as_json(told), news)
     except SlipError as error:
-        return (), (error,)
+        print_error(error)
+        return replace(outcome, problems=(*outcome.problems, error))
+    return told
 
 
-def _as_json(outcome: Outcome, news: Sequence[Notice], problems: Sequence[SlipError]) -> dict[str, object]:
+def _as_json(outcome: Outcome) -> dict[str, object]:
     states = [line.state for line in outcome.lines]
     return {
         **outcome.counts,
@@ -165,8 +161,8 @@ def _as_json(outcome: Outcome, news: Sequence[Notice], problems: Sequence[SlipEr
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
-        "notified": [each.text for each in news],
-        "errors": [summarize_error("", problem) for problem in (*outcome.problems, *problems)],
+        "notified": list(outcome.notified),
+        "errors": [summarize_error("", problem) for problem in outcome.problems],
     }
 
 
