@@ -1,26 +1,19 @@
-"""One log as a task: its executor in this process, its outcome as a report and as a ledger entry.
+"""One log as a task, its outcome as a report and as a ledger entry."""
 
-An executor takes tasks and returns `concurrent.futures.Future`; the runner uses nothing else of it.
-"""
-
-import os
 import pickle
 import resource
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.core import SlipError, end_with, limit_memory, objects_in, read_memory, silence_warnings
+from pipeline.core import SlipError, objects_in
 from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Store, stored_contexts
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
@@ -31,9 +24,6 @@ from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Store, stored_c
 STATES = ("done", "unchanged", "lossy", "refused", "failed", "quarantined")
 """States of a log; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
-
-FATAL_KILLS = 2
-"""Number of killed workers after which a log is quarantined until it, or its fingerprint, changes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,13 +129,11 @@ class Report:
         entry: new ledger entry of the log.
         is_new: whether a generation was published; false if nothing had changed.
         is_busy: whether another batch is working on the same run, so that nothing was done.
-        rss_bytes: memory of the worker afterwards.
     """
 
     entry: Entry
     is_new: bool = False
     is_busy: bool = False
-    rss_bytes: int = 0
 
 
 def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
@@ -188,7 +176,7 @@ def work_on(task: Task) -> Report:
         peak_bytes=_peak_bytes(),
     )
     Ledger(store).write(entry)
-    return Report(entry=entry, is_new=is_new, rss_bytes=read_memory(os.getpid()))
+    return Report(entry=entry, is_new=is_new)
 
 
 def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool]:
@@ -232,139 +220,3 @@ def _note_surprise(entry: Entry, error: BaseException) -> Entry:
 def _peak_bytes() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of an executor.
-
-    Attributes:
-        jobs: number of parallel tasks.
-        timeout_s: time limit of a task [s].
-        memory_bytes: memory limit of a task.
-        work: function to call with a task; importable by its name in a fresh process.
-    """
-
-    jobs: int
-    timeout_s: float
-    memory_bytes: int
-    work: Callable[[Task], Report]
-
-
-@dataclass(frozen=True)
-class Blame:
-    """Reason why a task has no report.
-
-    Attributes:
-        code: ``worker_died``, ``timed_out``, ``out_of_memory``, ``no_result``, ...
-        reason: one sentence without a full stop.
-        kills: number of workers lost to the task.
-    """
-
-    code: str
-    reason: str
-    kills: int
-
-
-class Executor(Protocol):
-    """Interface of the executors."""
-
-    depth: int
-    """Preferred number of submitted tasks, including waiting ones."""
-    spreads_blame: bool
-    """Whether a dying worker may implicate innocent tasks; suspects are then tried alone."""
-
-    def expect(self, tasks: int) -> None:
-        """Prepare for this number of tasks, which will certainly be submitted."""
-
-    def submit(self, task: Task) -> Future[Report]:
-        """Submit a task."""
-
-    def blame(self, task: Task, error: BaseException) -> Blame:
-        """Interpret the exception of a future."""
-
-    def close(self) -> None:
-        """End the workers, without waiting for unfinished tasks."""
-
-
-class InlineExecutor:
-    """This process, one log after the other: for debugging, and where processes cannot be started.
-
-    There is no isolation: a log that crashes, hangs or exhausts the memory ends the batch.
-    """
-
-    depth = 1
-    # No other task can be blamed.
-    spreads_blame = False
-
-    def __init__(self, settings: Settings) -> None:
-        self._work = settings.work
-
-    def expect(self, tasks: int) -> None:
-        """Do nothing: no preparation is needed."""
-
-    def submit(self, task: Task) -> Future[Report]:
-        """Work on a task immediately."""
-        future: Future[Report] = Future()
-        future.set_result(work_safely(self._work, task))
-        return future
-
-    def blame(self, task: Task, error: BaseException) -> Blame:
-        """Interpret the exception of a future; a log raises none."""
-        del task
-        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 0)
-
-    def close(self) -> None:
-        """Do nothing: there are no workers."""
-
-
-def format_exit(code: int | None) -> str:
-    """Describe an exit code in words."""
-    if code is None:
-        return "reason unknown"
-    return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def prepare_worker(parent: int) -> None:
-    """End this process when the batch that it works for is killed, and suppress its output."""
-    silence_warnings()
-    end_with(parent)
-
-
-def load_libraries() -> None:
-    """Load the libraries that every log needs, so that the first log does not include this time."""
-    import pipeline.analysis.analyze  # noqa: PLC0415 - only in workers
-    import pipeline.store.parquet_tables  # noqa: F401, PLC0415 - likewise
-
-
-DEATHS = "batch/deaths"
-
-
-def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float, memory_bytes: int) -> Report:
-    """Work on a task; end this process if it exceeds the time or memory limit.
-
-    Args:
-        work: function to call.
-        task: its task.
-        timeout_s: time limit [s].
-        memory_bytes: memory limit.
-    """
-
-    def give_up(held: int) -> None:
-        limit = memory_bytes / 1e9
-        _die_of(task, "out_of_memory", f"it used {held / 1e9:.2g} GB, more than {limit:.2g} GB")
-
-    late = f"it did not end within {timeout_s:g} s"
-    timer = threading.Timer(timeout_s, _die_of, (task, "timed_out", late))
-    timer.daemon = True
-    timer.start()
-    try:
-        with limit_memory(memory_bytes, give_up):
-            return work_safely(work, task)
-    finally:
-        timer.cancel()
-
-
-def _die_of(task: Task, code: str, reason: str) -> None:
-    Store(task.options.out).notes(DEATHS).write(task.log.path, {"code": code, "reason": reason})
-    os._exit(1)
