@@ -4,7 +4,7 @@ Results of two short simulated logs, one of them analyzed twice, with reports, p
 change is made alone and undone. Of manifests, lists, notes and other JSON every byte is changed, of tables
 and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Said*
 counts what verify tells without calling it damage. Left out is what no manifest names: files over all runs,
-and whole runs that are deleted.
+older generations, and whole runs that are deleted.
 """
 
 import argparse
@@ -112,6 +112,9 @@ def make_results(folder: Path) -> Path:
     return out
 
 
+_OLD = "old generations"
+
+
 def name_kind(name: str, current: set[str]) -> str:
     """What a file of the results is."""
     parts = name.split("/")
@@ -122,8 +125,7 @@ def name_kind(name: str, current: set[str]) -> str:
         return f"over all runs: *{Path(name).suffix}"
     if parts[-1] == "manifest.json":
         return "manifests"
-    age = "" if "/".join(parts[:-1]) in current else "old generations: "
-    return f"{age}{'marker' if parts[-1] == '.generation' else '*' + Path(name).suffix}"
+    return f"*{Path(name).suffix}" if "/".join(parts[:-1]) in current else _OLD
 
 
 def flip_bytes(files: Remembering, names: list[str], current: set[str], every: int) -> Table:
@@ -205,6 +207,7 @@ def damage_all(every: int) -> int:
         current = {manifest.folder.relative_to(out).as_posix() for manifest in store.manifests()}
         found = room.examine_files(files)
         names = [name for name in list_contents(files) if name not in found.unchecked]
+        names = [name for name in names if name_kind(name, current) != _OLD]
         print(f"{len(names)} files, ", end="")
         print(f"{sum(len(files.read(name) or b'') for name in names)} bytes; ", end="")
         print(f"unchanged: {len(found.problems)} problems, {len(found.unchecked)} unchecked")

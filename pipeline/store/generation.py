@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.store import files
-from pipeline.store.checksums import encode_manifest, encode_marker, load_manifest
+from pipeline.store.checksums import encode_manifest, load_manifest
 from pipeline.store.files import (
     JSON,
     MANIFEST,
@@ -271,7 +271,7 @@ class Generation:
         with name_disk_errors(self._home):
             manifest = self._make_manifest(details)
             data = encode_manifest(manifest)
-            self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes()))
+            self._draft(self._folder / MARKER, b"")
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
             files.sync_files([*self._drafts, *folders, self._folder])
             self._watch("folder_synced")
