@@ -172,7 +172,7 @@ def _check_names(stored: _Stored) -> None:
 # into a generation.
 
 LOG_NOTES = "batch/logs"
-"""Folder of the notes on logs, the only ones that several machines share."""
+"""Folder of the notes on logs."""
 
 
 NOTES = ("batch/", "identities/")
