@@ -347,7 +347,8 @@ def _format_origin(manifest: Manifest) -> list[str]:
     for table, stored in sorted(manifest.tables.items()):
         quarantined = f", {stored.quarantined} in quarantine" if stored.quarantined else ""
         contract = f"contract {stored.contract_version}"
-        lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {stored.sha256[:16]}")
+        digest = manifest.files[f"{table}.parquet"].sha256[:16]
+        lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {digest}")
     lines.append("configuration")
     lines.append("  " + json.dumps(_without_defaults(manifest.part("configuration"))))
     return lines

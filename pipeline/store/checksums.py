@@ -158,9 +158,9 @@ def _check_names(stored: _Stored) -> None:
     for name in (stored.folder, *stored.earlier, *stored.tables, *stored.files):
         if not is_file_name(name) or ("/" in name and name not in stored.files):
             raise ValueError(f"it names {name!r}")
-    for table, entry in stored.tables.items():
-        if entry.file != f"{table}.parquet":
-            raise ValueError(f"it names {entry.file!r} for the table {table!r}")
+    for table in stored.tables:
+        if f"{table}.parquet" not in stored.files:
+            raise ValueError(f"it names no file for the table {table!r}")
     if not is_key(stored.key):
         raise ValueError(f"its key is {stored.key!r}")
 

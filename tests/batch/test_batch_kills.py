@@ -44,7 +44,7 @@ def assert_whole(out: Path, undisturbed: dict[str, bytes]) -> None:
     store = Store(out)
     assert store.examine().problems == ()
     for manifest in store.manifests():
-        for name in manifest.names():
+        for name in manifest.files:
             path = manifest.path(name)
             assert path.read_bytes() == undisturbed[str(path.relative_to(out))]
     assert store.scan("slip").select(pl.len()).collect().item() >= 0

@@ -6,7 +6,6 @@ import os
 import shutil
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import polars as pl
 import pytest
@@ -16,11 +15,7 @@ from pipeline.store import Store, StoreError
 from pipeline.store.checksums import decode_checked, encode_checked
 from pipeline.store.files import hash_bytes
 
-if TYPE_CHECKING:
-    pass
-
 RUN = "2026/husky"
-ADDRESS = "memory://field/results"
 
 
 @pytest.fixture
@@ -48,7 +43,7 @@ def edit(path: Path, changes: dict[str, object]) -> None:
 
 
 ENTRY = {"bytes": 1, "sha256": "0" * 64}
-TABLE = {**ENTRY, "file": "slip.parquet", "rows": 1, "quarantined": 0, "contract_version": 1, "rules": {}}
+TABLE = {"rows": 1, "quarantined": 0, "contract_version": 1, "rules": {}}
 ELSEWHERE = [
     "../../../victim/x",
     "/etc/passwd",
@@ -73,8 +68,8 @@ def test_a_manifest_names_nothing_outside_of_its_run(store: Store, field: str) -
             "key": {"key": name},
             "earlier": {"earlier": [name]},
             "files": {"files": {name: ENTRY}},
-            "table": {"tables": {name: {**TABLE, "file": f"{name}.parquet"}}},
-            "table's file": {"tables": {"slip": {**TABLE, "file": name}}},
+            "table": {"tables": {name: TABLE}, "files": {f"{name}.parquet": ENTRY}},
+            "table's file": {"tables": {"slip": TABLE}, "files": {name: ENTRY}},
         }
         edit(path, changes[field])
         for look_at in (store.manifests, lambda: store.manifest(RUN), lambda: store.prune(0)):
@@ -148,8 +143,9 @@ def test_a_table_has_the_columns_of_its_contract(store: Store, change: str) -> N
     odd = frame.drop("t") if change == "a column less" else frame.with_columns(pl.lit("x").alias("t"))
     odd.write_parquet(path)
     home = path.parents[1] / "manifest.json"
-    entry = {**asdict(manifest.tables["slip"]), "sha256": hash_bytes(path.read_bytes())}
-    edit(home, {"tables": {"slip": entry}})
+    files = {name: asdict(entry) for name, entry in manifest.files.items()}
+    files["slip.parquet"]["sha256"] = hash_bytes(path.read_bytes())
+    edit(home, {"files": files})
     with pytest.raises(StoreError, match="not those of its contract") as caught:
         store.read(RUN, "slip")
     assert caught.value.code == "table_damaged"
