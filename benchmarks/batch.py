@@ -36,9 +36,9 @@ class Run:
         begun_s: until the first log was begun.
         ending_s: after the last log was done.
         own_s: processor time of the process that leads.
-        workers_s: processor time of the workers.
+        workers_s: time of the workers.
         peak_bytes: most memory of the process that leads.
-        rss_bytes: memory of the worker after each log, in the order in which they were done.
+        rss_bytes: peak memory of the worker of each log, in the order in which they were done.
     """
 
     seconds: float
@@ -77,14 +77,14 @@ def run_batch(logs: Path, out: Path, jobs: int) -> Run:
     )
     seconds = time.perf_counter() - started
     cost = json.loads(done.stderr.splitlines()[-1])
-    rss = {line["path"]: line["rss_bytes"] for line in json.loads(done.stdout)["logs"]}
+    rss = {line["path"]: line["peak_bytes"] for line in json.loads(done.stdout)["logs"]}
     entries = sorted(Ledger(Store(out)).read_all().values(), key=lambda entry: entry.at)
     return Run(
         seconds=seconds,
         begun_s=min(entry.at - entry.seconds for entry in entries) - before,
         ending_s=before + seconds - entries[-1].at,
         own_s=cost["own_s"],
-        workers_s=cost["children_s"],
+        workers_s=sum(entry.seconds for entry in entries),
         peak_bytes=cost["own_peak_bytes"],
         rss_bytes=tuple(rss[entry.log.path] for entry in entries),
     )
@@ -102,7 +102,7 @@ def select(logs: Path, folder: Path, count: int) -> Path:
 def measure_growth(logs: Path, work: Path, counts: list[int]) -> None:
     """Cost per log as the season grows, of a second look at it, and the memory over time."""
     print("two processes, as the season grows")
-    print("       first  per log  cpu per   second  memory [MB]: workers in the")
+    print("       first  per log  work per  second  memory [MB]: workers in the")
     print("logs   [s]    [ms]     log [ms]  [s]     first | last tenth; leader")
     for count in counts:
         season, out = select(logs, work / "season", count), work / "grown"
@@ -129,7 +129,7 @@ def compare_processes(logs: Path, work: Path, count: int, rounds: int) -> None:
             runs[jobs].append(run_batch(season, work / "compared", jobs))
     print(f"\n{count} logs on one and two processes, best of {rounds}")
     print("           clock  alone:        leader  workers'      workers'")
-    print("processes  [s]    begin + end   cpu [s] cpu/log [ms]  memory [MB]")
+    print("processes  [s]    begin + end   cpu [s] s/log [ms]    memory [MB]")
     best = {jobs: min(some, key=lambda run: run.seconds) for jobs, some in runs.items()}
     for jobs, run in best.items():
         print(

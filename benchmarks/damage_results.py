@@ -4,7 +4,7 @@ Results of two short simulated logs, one of them analyzed twice, with reports, p
 change is made alone and undone. Of manifests, lists, notes and other JSON every byte is changed, of tables
 and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Said*
 counts what verify tells without calling it damage. Left out is what no manifest names: files over all runs,
-whole runs that are deleted, and in a bucket manifests that are, since it has no link to a run's results.
+older generations, and whole runs that are deleted.
 """
 
 import argparse
@@ -23,10 +23,8 @@ from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store import verification as room
 from pipeline.store.files import do_nothing, hash_bytes
-from pipeline.store.mirror import Mirror
 
 FLIPS = (0x01, 0x80, 0xFF)
-ADDRESS = "memory://damage/results"
 
 
 class Watch:
@@ -68,7 +66,7 @@ class Table:
 class Remembering:
     """The files of results, of which those that have not changed are hashed once."""
 
-    def __init__(self, files: room.DiskFiles | Mirror) -> None:
+    def __init__(self, files: room.DiskFiles) -> None:
         self._files = files
         self._names = files.names(do_nothing)
         self._contents: dict[str, bytes | None] = {}
@@ -98,23 +96,23 @@ class Remembering:
         return self._files.locate(name)
 
 
-def make_results(folder: Path, address: str | None) -> Path:
+def make_results(folder: Path) -> Path:
     """Results of two logs; of one there is an older generation."""
     logs, out = folder / "logs", folder / "out"
     simulate_case("husky_tile", out=logs / "a.mcap", duration_s=6.0, seed=1)
     simulate_case("warthog_ice", out=logs / "b.mcap", duration_s=6.0, seed=2)
     for rate in ("20.0", "10.0"):
         (logs / "a.toml").write_text(f"[velocity]\nrate_hz = {rate}\n")
-        options = Options(out=out, report=address is None)
-        request = Request(
-            targets=(str(logs),), options=options, executor="inline", settle_s=0.0, address=address
-        )
+        options = Options(out=out, report=True)
+        request = Request(targets=(str(logs),), options=options, executor="inline", settle_s=0.0)
         outcome = run_batch(request, Watch())
         if outcome.has_failed:
             raise SystemExit(f"the batch failed: {outcome}")
-    if address is None:
-        Store(out).write_results_text("comparison.html", "<p>written by slip compare</p>")
+    Store(out).write_results_text("comparison.html", "<p>written by slip compare</p>")
     return out
+
+
+_OLD = "old generations"
 
 
 def name_kind(name: str, current: set[str]) -> str:
@@ -127,8 +125,7 @@ def name_kind(name: str, current: set[str]) -> str:
         return f"over all runs: *{Path(name).suffix}"
     if parts[-1] == "manifest.json":
         return "manifests"
-    age = "" if "/".join(parts[:-1]) in current else "old generations: "
-    return f"{age}{'marker' if parts[-1] == '.generation' else '*' + Path(name).suffix}"
+    return f"*{Path(name).suffix}" if "/".join(parts[:-1]) in current else _OLD
 
 
 def flip_bytes(files: Remembering, names: list[str], current: set[str], every: int) -> Table:
@@ -149,8 +146,8 @@ def flip_bytes(files: Remembering, names: list[str], current: set[str], every: i
 class Exchange:
     """Files deleted, cut, and put in the place of others, and what was noticed of it."""
 
-    def __init__(self, files: Remembering, names: list[str], current: set[str], *, in_bucket: bool) -> None:
-        self.table, self._in_bucket = Table(), in_bucket
+    def __init__(self, files: Remembering, names: list[str], current: set[str]) -> None:
+        self.table = Table()
         self._files, self._names, self._current = files, names, current
         self._before = room.examine_files(files)
 
@@ -174,8 +171,7 @@ class Exchange:
         self._judge(f"{kind}: cut", {name: whole[: len(whole) // 2]})
         # A note may go, or be that of another name, at any time: it costs a look at the log.
         if not kind.startswith("notes"):
-            if not (self._in_bucket and kind == "manifests"):
-                self._judge(f"{kind}: deleted", {name: None})
+            self._judge(f"{kind}: deleted", {name: None})
             for other in self._names:
                 if name_kind(other, self._current) == kind:
                     self._judge(f"{kind}: copied over", {other: whole})
@@ -194,31 +190,30 @@ class Exchange:
             self._files.change(name, content)
 
 
-def list_contents(files: room.DiskFiles | Mirror) -> list[str]:
+def list_contents(files: room.DiskFiles) -> list[str]:
     """Files that hold something: no locks, and nothing that another program keeps there."""
     return sorted(
         name for name in files.names(do_nothing) if not name.endswith(".lock") and "/claims/" not in name
     )
 
 
-def damage_all(every: int, *, in_bucket: bool) -> int:
+def damage_all(every: int) -> int:
     """Print the tables; how many changes were not noticed."""
     folder = Path(tempfile.mkdtemp(prefix="damage-"))
     try:
-        address = ADDRESS if in_bucket else None
-        out = make_results(folder, address)
+        out = make_results(folder)
         store = Store(out)
-        source: room.DiskFiles | Mirror = room.DiskFiles(out) if address is None else Mirror(address, out)
-        files = Remembering(source)
+        files = Remembering(room.DiskFiles(out))
         current = {manifest.folder.relative_to(out).as_posix() for manifest in store.manifests()}
         found = room.examine_files(files)
         names = [name for name in list_contents(files) if name not in found.unchecked]
-        print(f"{'object store' if in_bucket else 'folder'}: {len(names)} files, ", end="")
+        names = [name for name in names if name_kind(name, current) != _OLD]
+        print(f"{len(names)} files, ", end="")
         print(f"{sum(len(files.read(name) or b'') for name in names)} bytes; ", end="")
         print(f"unchanged: {len(found.problems)} problems, {len(found.unchecked)} unchecked")
         one = flip_bytes(files, names, current, every)
         one.show(f"changed bytes (of tables, pages: every {every}.)")
-        other = Exchange(files, names, current, in_bucket=in_bucket).try_all()
+        other = Exchange(files, names, current).try_all()
         other.show("files and runs")
         return one.missed.total() + other.missed.total() + len(found.problems)
     finally:
@@ -227,8 +222,7 @@ def damage_all(every: int, *, in_bucket: bool) -> int:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=97, help="of tables and pages only every n-th byte")
-    parser.add_argument("--bucket", action="store_true", help="results on an object store in memory")
 
 
 def run(asked: argparse.Namespace) -> None:
-    raise SystemExit(os.EX_OK if damage_all(asked.every, in_bucket=asked.bucket) == 0 else 1)
+    raise SystemExit(os.EX_OK if damage_all(asked.every) == 0 else 1)

@@ -140,7 +140,7 @@ class Run(StoredRun):
         distance_m: way of the body [m]; None where nothing was compared.
         findings: what was noticed: id, severity, text, where, t_start and t_end [s]; gravest first.
         report: the offline page; None where it was not asked for.
-        tables: names of its tables; `slip results explain RUN TABLE.COLUMN` tells units and frames.
+        tables: names of its tables; the page Tables of the handbook tells units and frames.
     """
 
     def __init__(self, manifest: Manifest, store: Store) -> None:

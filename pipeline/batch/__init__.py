@@ -58,7 +58,6 @@ class Request:
     Attributes:
         targets: logs, folders, globs and lists.
         options: options of the analysis of each log.
-        address: address of the results, if they are on an object store; ``options.out`` is then their mirror.
         executor: ``local``, ``inline``, ``dask``, or the address of a scheduler.
         jobs: number of logs processed in parallel.
         shard: share of this machine in the logs.
@@ -71,7 +70,6 @@ class Request:
 
     targets: tuple[str, ...]
     options: Options
-    address: str | None = None
     executor: str = "local"
     jobs: int = field(default_factory=count_cores)
     shard: Shard | None = None

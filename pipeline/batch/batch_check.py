@@ -1,6 +1,6 @@
 """Status of a batch (done, failed, quarantined), and verification and repair of results."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -12,10 +12,8 @@ from pipeline.store import (
     MANIFEST,
     RUNS,
     UPLOADS,
-    DiskFiles,
     Examination,
     Manifest,
-    Mirror,
     Problem,
     Sample,
     Store,
@@ -23,10 +21,10 @@ from pipeline.store import (
     Tally,
     check_home,
     encode_run,
-    parse_manifest,
+    load_manifest,
 )
 
-_UNREADABLE = ("manifest_damaged", "name_clash")
+_UNREADABLE = {"manifest_damaged", "name_clash"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,105 +44,74 @@ class Repair:
 
 
 def repair_results(
-    store: Store, examination: Examination, mirror: Mirror | None = None, *, follow_remote: bool = False
+    store: Store, examination: Examination, *, follow_remote: bool = False
 ) -> tuple[Repair, ...]:
     """Schedule or perform all possible repairs; no usable result is removed.
 
     Args:
         store: the results.
         examination: problems of the results.
-        mirror: the mirror of the store, if the results are on an object store.
         follow_remote: whether to look for logs at addresses that the results contain.
 
     Raises:
         StoreError: the results cannot be written.
     """
-    return tuple(_Repairer(store, examination, mirror, follow_remote=follow_remote).repair())
-
-
-class _Repairer:
-    def __init__(
-        self, store: Store, examination: Examination, mirror: Mirror | None, *, follow_remote: bool
-    ) -> None:
-        self._store = store
-        self._follow_remote = follow_remote
-        self._target = mirror or store
-        self._files = mirror or DiskFiles(store.root)
-        self._examination = examination
-        entries = Ledger(store).read_all().values()
-        self._logs: Mapping[str, str] = {
-            f"runs/{encode_run(entry.run)}": entry.log.path for entry in entries if entry.run
-        }
-
-    def repair(self) -> Iterator[Repair]:
-        problems = self._examination.problems
-        for problem in problems:
-            if not problem.home:
-                yield self._repair_file(problem)
-        of_runs = sorted((each for each in problems if each.home), key=lambda each: each.home)
-        for home, some in groupby(of_runs, key=lambda each: each.home):
-            yield self._repair_run(home, list(some))
-
-    def _repair_file(self, problem: Problem) -> Repair:
-        name = problem.path.relative_to(self._store.root).as_posix()
-        if problem.code == "left_out":
-            return Repair(subject=name, action="left", what="find out who made it, and remove it")
-        self._target.remove(name)
-        forget_pools(self._store)
-        return Repair(subject=name, action="removed", what="no result is lost")
-
-    def _repair_run(self, home: str, problems: Sequence[Problem]) -> Repair:
-        subject = problems[0].run
+    repairs = [_repair_file(store, problem) for problem in examination.problems if not problem.home]
+    entries = Ledger(store).read_all().values()
+    logs = {f"{RUNS}/{encode_run(entry.run)}": entry.log.path for entry in entries if entry.run}
+    of_runs = sorted((each for each in examination.problems if each.home), key=lambda each: each.home)
+    for home, some in groupby(of_runs, key=lambda each: each.home):
+        problems = list(some)
         codes = {problem.code for problem in problems}
-        remains = _explain_remains(codes)
-        if remains:
-            return Repair(subject=subject, action="left", what=remains)
-        log = self._find_log(home)
-        try:
-            location = locate_recorded(log, follow_remote=self._follow_remote) if log else None
-        except LogError as error:
-            return Repair(subject=subject, action="left", what=f"its log is at {log}: {error.what}")
-        if location is None or not (location.is_file() or location.is_dir()):
-            why = f"its log {log} is gone" if log else "its log is not known"
-            return Repair(subject=subject, action="lost", what=f"it cannot be made again: {why}")
-        self._queue(home, codes)
-        return Repair(subject=subject, action="queued", what=f"the next batch over {log} makes it again")
-
-    def _queue(self, home: str, codes: set[str]) -> None:
-        manifest = self._read_manifest(home)
-        if codes & set(_UNREADABLE):
-            # No reader can use it, and no writer can replace it.
-            self._target.remove(f"{home}/{MANIFEST}")
-        elif manifest is not None:
-            self._store.ask_again(manifest)
-
-    def _find_log(self, home: str) -> str:
-        """Recorded place of the log of a run: by the notes of batches, else by its own manifest."""
-        manifest = self._read_manifest(home)
-        log = "" if manifest is None else str(manifest.part("log").get("path") or "")
-        return self._logs.get(home) or log
-
-    def _read_manifest(self, home: str) -> Manifest | None:
-        """Manifest in the folder of a run; None if there is none, or none of that run."""
-        try:
-            data = self._files.read(f"{home}/{MANIFEST}")
-            manifest = None if data is None else parse_manifest(data, self._store.root / home)
-            if manifest is not None:
-                check_home(manifest.run, self._store.root / home, top=self._store.root / RUNS)
-        except (StoreError, OSError):
-            return None
-        return manifest
+        action, what = _repair_run(store, home, codes, logs.get(home, ""), follow_remote=follow_remote)
+        repairs.append(Repair(subject=problems[0].run, action=action, what=what))
+    return tuple(repairs)
 
 
-def _explain_remains(codes: set[str]) -> str:
-    """Text for a run that needs no repair, or cannot be repaired; empty otherwise."""
+def _repair_file(store: Store, problem: Problem) -> Repair:
+    name = problem.path.relative_to(store.root).as_posix()
+    if problem.code == "left_out":
+        return Repair(subject=name, action="left", what="find out who made it, and remove it")
+    store.remove(name)
+    forget_pools(store)
+    return Repair(subject=name, action="removed", what="no result is lost")
+
+
+def _repair_run(
+    store: Store, home: str, codes: set[str], log: str, *, follow_remote: bool
+) -> tuple[str, str]:
+    """Action and its text for the problems of a run; ``log`` is where the notes of batches saw its log."""
     if "manifest_too_new" in codes:
-        return "a newer version wrote it: use that one"
-    if not codes <= {"old_generation", "extra_file"}:
-        return ""
-    if "extra_file" in codes:
-        return "all that was written is intact; remove the files that were not written with it"
-    return "the current results are intact; remove old ones with `slip batch --prune --keep 0`"
+        return "left", "a newer version wrote it: use that one"
+    if codes == {"extra_file"}:
+        return "left", "all that was written is intact; remove the files that were not written with it"
+    manifest = _read_manifest(store, home)
+    log = log or ("" if manifest is None else str(manifest.part("log").get("path") or ""))
+    try:
+        location = locate_recorded(log, follow_remote=follow_remote) if log else None
+    except LogError as error:
+        return "left", f"its log is at {log}: {error.what}"
+    if location is None or not (location.is_file() or location.is_dir()):
+        why = f"its log {log} is gone" if log else "its log is not known"
+        return "lost", f"it cannot be made again: {why}"
+    if codes & _UNREADABLE:
+        # No reader can use it, and no writer can replace it.
+        store.remove(f"{home}/{MANIFEST}")
+    elif manifest is not None:
+        store.ask_again(manifest)
+    return "queued", f"the next batch over {log} makes it again"
+
+
+def _read_manifest(store: Store, home: str) -> Manifest | None:
+    """Manifest in the folder of a run; None if there is none, or none of that run."""
+    path = store.root / home
+    try:
+        manifest = load_manifest(path)
+        if manifest is not None:
+            check_home(manifest.run, path, top=store.root / RUNS)
+    except (StoreError, OSError):
+        return None
+    return manifest
 
 
 _NOT_FOLLOWED = "remote_not_followed"
@@ -205,7 +172,6 @@ def verify_results(
     *,
     logs: bool,
     notify: Callable[[str], None],
-    mirror: Mirror | None = None,
     repair: bool = False,
     follow_remote: bool = False,
     sample: Sample | None = None,
@@ -216,7 +182,6 @@ def verify_results(
         store: the results.
         logs: whether to read the logs, which takes as long as reading them from disk.
         notify: called with the name of each run before its log is read.
-        mirror: the mirror of the store, if the results are on an object store.
         repair: whether to repair what can be repaired.
         follow_remote: whether to look for logs at addresses that the results contain.
         sample: sample of the files and logs to read; None for all.
@@ -224,8 +189,8 @@ def verify_results(
     Raises:
         StoreError: the results cannot be written.
     """
-    examination = (mirror or store).examine(sample)
-    repairs = repair_results(store, examination, mirror, follow_remote=follow_remote) if repair else ()
+    examination = store.examine(sample)
+    repairs = repair_results(store, examination, follow_remote=follow_remote) if repair else ()
     manifests = store.survey().manifests
     problems: list[LogProblem] = []
     tally = Tally()

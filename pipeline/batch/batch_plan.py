@@ -1,7 +1,8 @@
 """Before and after a batch: which logs are done and what their runs are called; pages and pruning."""
 
 import hashlib
-from collections.abc import Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -14,7 +15,7 @@ from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
-from pipeline.core import SlipError, group_by, read_bounded, read_version, walk_files
+from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets, read_tables
@@ -22,7 +23,6 @@ from pipeline.store import (
     LogIdentities,
     LogSighting,
     Manifest,
-    Mirror,
     Store,
     StoreError,
     hash_json,
@@ -92,88 +92,61 @@ def _fingerprint_program() -> object:
 _DIGITS = 8
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class KnownRun:
-    """Run with results.
-
-    Attributes:
-        run: name of the run.
-        sha256: hash of its log.
-        size: size of its log [bytes]; None if not recorded.
-        is_present: whether the same content is still at that path and belongs to this batch.
-    """
+    """Run with results: its name, and the hash and size [bytes] of its log."""
 
     run: str
     sha256: str
-    size: int | None
-    is_present: bool
+    size: int
 
 
-@dataclass(frozen=True, kw_only=True)
-class Names:
-    """Names of runs.
-
-    Attributes:
-        runs: run by path of its log.
-        copies: run with the same content, by path of the log that is a copy.
-    """
-
-    runs: Mapping[Path, str]
-    copies: Mapping[Path, str]
-
-
-def list_doubtful(sizes: Mapping[Path, int], known: Sequence[KnownRun]) -> tuple[Path, ...]:
-    """New logs that must be hashed before they can be named.
-
-    These are logs that may be a copy of another one, by their size, and those that need digits of their hash.
+def name_runs(
+    sizes: Mapping[Path, int],
+    known: Sequence[KnownRun],
+    find_hash: Callable[[Path], str],
+    is_present: Callable[[str], bool],
+) -> tuple[dict[Path, str], dict[Path, str]]:
+    """Name the runs of new logs.
 
     Args:
         sizes: size of every new log [bytes].
         known: the runs that have results.
+        find_hash: hash of a log, empty if it cannot be read; called where a log may be a copy of another one,
+            by its size, or needs digits of its hash.
+        is_present: whether the log of a run with results is still there, unchanged and of this batch.
+
+    Returns:
+        The run of each log by its path; and of each log that is a copy, the run with the same content.
     """
-    taken_sizes = {run.size for run in known}
-    taken_names = {run.run for run in known}
-    by_size = group_by((sizes[path], path) for path in sorted(sizes)).values()
-    by_name = group_by((name_plainly(path), path) for path in sorted(sizes))
-    alike = {path for group in by_size if len(group) > 1 for path in group}
-    alike |= {path for path, size in sizes.items() if size in taken_sizes or None in taken_sizes}
-    crowded = {path for name, group in by_name.items() for path in group[name not in taken_names :]}
-    return tuple(sorted(alike | crowded))
-
-
-def assign_names(new: Collection[Path], hashes: Mapping[Path, str], known: Sequence[KnownRun]) -> Names:
-    """Name the runs of new logs.
-
-    Args:
-        new: logs without a run.
-        hashes: hashes of the readable logs from `list_doubtful`.
-        known: the runs that have results.
-    """
-    holders = {run.sha256: run for run in known}
-    taken = {run.run for run in known}
+    alike = Counter([*sizes.values(), *(run.size for run in known)])
+    alike_named = Counter([*map(name_plainly, sizes), *(run.run for run in known)])
+    hashes = {
+        path: find_hash(path)
+        for path, size in sizes.items()
+        if alike[size] > 1 or alike_named[name_plainly(path)] > 1
+    }
+    holders = {run.sha256: run.run for run in known}
     runs: dict[Path, str] = {}
     copies: dict[Path, str] = {}
-    first: dict[str, Path] = {}
-    again: list[Path] = []
-    for path in sorted(new):
-        content = hashes.get(path, "")
-        holder = holders.get(content)
+    for path in sorted(hashes):
+        holder = holders.get(hashes[path])
+        if holder is not None:
+            # A log that was moved keeps its run: its results stay valid.
+            is_copy = holder in runs.values() or is_present(holder)
+            (copies if is_copy else runs)[path] = holder
+    taken = {run.run for run in known}
+    first: dict[str, str] = {}
+    for path in sorted(set(sizes) - set(runs) - set(copies)):
+        content, plain = hashes.get(path, ""), name_plainly(path)
         if content in first:
-            again.append(path)
-        elif holder is not None and holder.is_present:
-            copies[path] = holder.run
-        else:
-            if content:
-                first[content] = path
-            if holder is not None:
-                # The log was moved: its results stay valid.
-                runs[path] = holder.run
-    for path in sorted(set(new) - set(copies) - set(runs) - set(again)):
-        plain = name_plainly(path)
-        runs[path] = plain if plain not in taken else f"{plain}-{hashes.get(path, '')[:_DIGITS]}"
+            copies[path] = first[content]
+            continue
+        runs[path] = plain if plain not in taken else f"{plain}-{content[:_DIGITS]}"
         taken.add(runs[path])
-    copies |= {path: runs[first[hashes[path]]] for path in again}
-    return Names(runs=runs, copies=copies)
+        if content:
+            first[content] = runs[path]
+    return runs, copies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,61 +246,41 @@ def _name_items(
 ) -> list[Item]:
     identities = LogIdentities(store)
     logs = {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
-    runs = {_path_of(log): run for run, log in logs.items()}
+    paths = {run: str(to_location(str(log.get("path")))) for run, log in logs.items()}
+    runs = {path: run for run, path in paths.items()}
     runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
     new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
-    looks = {item.log.path: item for item in items}
-    known = [_know_run(run, log, looks, identities, set(new.values())) for run, log in logs.items() if new]
-    hashes = _hash_logs(list_doubtful(new, known), identities)
-    names = assign_names(list(new), hashes, known)
+    places = {item.log.path: item.path for item in items}
+    known = [
+        KnownRun(run, str(log.get("sha256")), size)
+        for run, log in logs.items()
+        if isinstance(size := log.get("bytes"), int)
+    ]
+
+    def find_hash(path: Path) -> str:
+        if (content := identities.lookup(path)) is None:
+            try:
+                seen = see_log(path)
+                content = hash_log(path)
+            except (LogError, OSError):
+                # The later analysis of the log reports the error.
+                return ""
+            identities.remember(path, content, seen=seen)
+        return content
+
+    def is_present(run: str) -> bool:
+        place = places.get(paths[run])
+        return place is not None and find_hash(place) == logs[run].get("sha256")
+
+    named, copies = name_runs(new, known, find_hash, is_present)
     return [
         replace(
             item,
-            run=runs.get(item.log.path) or names.runs.get(item.path, ""),
-            copy_of=names.copies.get(item.path, ""),
+            run=runs.get(item.log.path) or named.get(item.path, ""),
+            copy_of=copies.get(item.path, ""),
         )
         for item in open_items
     ]
-
-
-def _know_run(
-    run: str,
-    log: Mapping[str, object],
-    looks: Mapping[str, Item],
-    identities: LogIdentities,
-    sizes: Collection[int],
-) -> KnownRun:
-    size = log.get("bytes")
-    item = looks.get(_path_of(log))
-    # Hash a run's log again only if a new log may be a copy of it.
-    is_alike = item is not None and (not isinstance(size, int) or size in sizes)
-    content = _hash_logs([item.path], identities).get(item.path) if is_alike and item is not None else None
-    return KnownRun(
-        run=run,
-        sha256=str(log.get("sha256")),
-        size=size if isinstance(size, int) else None,
-        is_present=content is not None and content == log.get("sha256"),
-    )
-
-
-def _path_of(log: Mapping[str, object]) -> str:
-    return str(to_location(str(log.get("path"))))
-
-
-def _hash_logs(paths: Sequence[Path], identities: LogIdentities) -> dict[Path, str]:
-    hashes: dict[Path, str] = {}
-    for path in paths:
-        known = identities.lookup(path)
-        if known is None:
-            try:
-                seen = see_log(path)
-                known = hash_log(path)
-            except (LogError, OSError):
-                # The later analysis of the log reports the error.
-                continue
-            identities.remember(path, known, seen=seen)
-        hashes[path] = known
-    return hashes
 
 
 _NOTES = "batch/pooled"
@@ -366,28 +319,6 @@ def refresh_pools(store: Store) -> bool:
 def forget_pools(store: Store) -> None:
     """Invalidate the tables and pages over all runs, so that the next batch makes them again."""
     store.notes(_NOTES).remove(_NOTE)
-
-
-def refresh_remote_pools(mirror: Mirror) -> None:
-    """As `refresh_pools`, for results on an object store, including runs added by other machines.
-
-    A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
-    catalogue links them.
-    """
-    from pipeline.datasets import FLEET, TREND  # noqa: PLC0415 - heavy
-    from pipeline.report import PAGES  # noqa: PLC0415 - heavy
-
-    mirror.pull_index()
-    tables = ["aggregates"]
-    if (mirror.store.root / FLEET).is_file():
-        tables += ["findings", "estimates"]
-    if (mirror.store.root / TREND).is_file():
-        tables += ["slip", "findings", "estimates"]
-    mirror.pull_tables(tables, mirror.store.manifests())
-    forget_pools(mirror.store)
-    refresh_pools(mirror.store)
-    for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
-        mirror.push_file(mirror.store.root / name)
 
 
 def _hash_runs(store: Store) -> str:

@@ -1,239 +1,69 @@
-"""What somebody should know after a batch: logs that failed, what changed over dates or against a baseline.
-
-Each is sent once, to a command of the user, and again only after a night without it.
-"""
+"""What somebody should know after a batch, given once to a command of the user."""
 
 import json
-import os
 import subprocess
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.batch import BatchError
 from pipeline.batch.batch_run import Outcome
-from pipeline.core import SlipError, make_plain, shorten
-from pipeline.datasets import BROKEN, Baseline, Limits, check_runs, format_quiet, read_baseline, read_digest
-from pipeline.models import ModelFile, read_model
-from pipeline.report.trend_page import renew_trend
-from pipeline.sources import load_vehicle
-from pipeline.store import Manifest, Store
-from pipeline.words.check import format_verdict
+from pipeline.core import make_plain, shorten
+from pipeline.store import Store
 
-_NOTES = "batch/notified"
-_NOTE = "sent"
-_SHORT = {"failed", "quarantined", "left"}
 _NOTIFY_S = 120.0
 """Time that the command of the user may take [s]: mail servers that do not answer give up after a minute."""
-_MOST_NOTICES = 50
-"""News that a message lists: a screen; with `_LONGEST` far below the 128 kB that a variable may hold."""
-_LONGEST = 500
-"""Characters of one of them: four long sentences."""
+_SHORT = {"failed", "quarantined", "left", "skipped"}
 
 
-@dataclass(frozen=True)
-class Notice:
-    """One thing that somebody should know.
+def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
+    """Texts of what the last message did not tell, by what they are about.
 
-    Attributes:
-        key: what it is; the same on another night.
-        text: for people, one line.
-        is_alert: a change of the robot or of the data; else something failed.
-    """
-
-    key: str
-    text: str
-    is_alert: bool = False
-
-
-@dataclass(frozen=True)
-class Looked:
-    """What was looked at after a batch.
-
-    Attributes:
-        lines: what came out, for people: a label and a text each.
-        notices: what somebody should know.
-    """
-
-    lines: tuple[tuple[str, str], ...] = ()
-    notices: tuple[Notice, ...] = ()
-
-
-def list_failures(outcome: Outcome) -> list[Notice]:
-    """Logs without results, and what went wrong with the tables over all runs."""
-    short = [line for line in outcome.lines if line.state in _SHORT]
-    logs = [Notice(f"{line.state} {line.path} {line.code}", f"{line.path}: {line.reason}") for line in short]
-    return [*logs, *map(note_error, outcome.problems)]
-
-
-def note_error(error: Exception) -> Notice:
-    """An error as something that somebody should know."""
-    if not isinstance(error, SlipError):
-        return Notice(f"error {type(error)}", f"unexpected error: {error!r}")
-    return Notice(f"error {error.code} {error.where}", str(error))
-
-
-def look_at_trend(root: Path) -> Looked:
-    """Follow the trend with the options of the last time; to have no dates is no failure."""
-    try:
-        trend = renew_trend(Store(root))
-    except SlipError as error:
-        if error.code == "nothing_to_follow":
-            return Looked((("trend", error.what),))
-        return Looked((("trend", str(error)),), (note_error(error),))
-    notices = [
-        Notice(f"trend {one.group} {one.quantity} {one.since}", one.text, is_alert=True)
-        for one in trend.alerts
-    ]
-    quiet = format_quiet(trend.series, trend.parameters)
-    return Looked(tuple(("trend", one.text) for one in notices) or (("trend", quiet),), tuple(notices))
-
-
-def open_reference(path: Path) -> ModelFile | Baseline:
-    """A model file, or a baseline that `slip check --keep` wrote.
-
-    Raises:
-        SlipError: it is neither, or it cannot be read.
-    """
-    if path.suffix not in {".json", ".toml"}:
-        hint = "Write one with slip check BEFORE AFTER --keep robot.json, or give a model file (robot.toml)."
-        raise BatchError("not_a_baseline", "a baseline or a model file is needed", where=str(path), hint=hint)
-    return read_baseline(path) if path.suffix == ".json" else read_model(path)
-
-
-def look_at_new_runs(
-    outcome: Outcome, root: Path, name: str, known: ModelFile | Baseline, limits: Limits | None
-) -> Looked:
-    """Check the runs that a batch made against a baseline of their vehicle.
+    These are logs without results or with losses, logs that cannot show slip, and problems of the batch.
 
     Args:
-        outcome: what the batch did.
-        root: its results.
-        name: what the baseline is called.
-        known: the baseline.
-        limits: limits to judge by.
+        root: the results, which keep what was told.
+        outcome: what came out.
     """
-    label = f"check {name}"
-    vehicle = (known.model if isinstance(known, Baseline) else known).model.vehicle
-    store = Store(root)
-    try:
-        new = _list_new(outcome, store, known)
-        if not new:
-            return Looked(((label, f"no new run of {vehicle.name}"),))
-        check = check_runs(known, new, store, limits=limits)
-    except SlipError as error:
-        return Looked(((label, str(error)),), (note_error(error),))
-    verdict = format_verdict(check)
-    if check.code != BROKEN:
-        return Looked(((label, verdict),))
-    named = [*check.list_status("changed"), *(one.name for one in check.limits if one.outcome == "broken")]
-    return Looked(
-        ((label, verdict),), (Notice(f"{label} {sorted(named)}", f"{name}: {verdict}", is_alert=True),)
-    )
-
-
-def _list_new(outcome: Outcome, store: Store, known: ModelFile | Baseline) -> list[Manifest]:
-    """Runs that the batch made, of the vehicle of a baseline and not in it."""
-    vehicle = (known.model if isinstance(known, Baseline) else known).model.vehicle
-    held = {one.sha256 for one in known.readings} if isinstance(known, Baseline) else set()
-    made = [store.manifest(line.run) for line in outcome.lines if line.state in {"done", "lossy"}]
-    return [
-        one
-        for one in made
-        if one is not None and load_vehicle(one).id == vehicle.id and read_digest(one) not in held
-    ]
-
-
-def send_news(
-    root: Path, command: str, notices: Sequence[Notice], report: Sequence[str], *, code: int
-) -> tuple[Notice, ...]:
-    """Send the user's command what is new since the last message; without news, nothing.
-
-    Args:
-        root: the results, which keep what was sent.
-        command: a line for the shell; it gets the message, as `compose` makes it.
-        notices: all that somebody should know tonight.
-        report: what came out, line by line, for the end of the message.
-        code: exit code of the batch.
-
-    Returns:
-        What was new.
-
-    Raises:
-        BatchError: ``notify_failed``; the next batch sends it again.
-    """
-    notes = Store(root).notes(_NOTES)
-    before = (notes.read(_NOTE) or {}).get("keys")
-    known = set(before) if isinstance(before, list) else set()
-    news = tuple(notice for notice in notices if notice.key not in known)
-    if news:
-        as_before = len(notices) - len(news)
-        subject, lines = compose(news, as_before, report, root)
-        call_command(command, subject, lines, code=code, results=root)
-    notes.write(_NOTE, {"keys": [notice.key for notice in notices]})
-    return news
-
-
-def compose(
-    news: Sequence[Notice], as_before: int, report: Sequence[str], results: Path
-) -> tuple[str, list[str]]:
-    """Subject and lines of a message."""
-    counts = [
-        f"{count} {word}{'s' * (count != 1 and word != 'failed')}"
-        for word, count in (
-            ("failed", sum(not notice.is_alert for notice in news)),
-            ("alert", sum(notice.is_alert for notice in news)),
-        )
-        if count
-    ]
-    lines = [
-        f"{'alert' if notice.is_alert else 'failed':<8}{shorten(make_plain(notice.text), _LONGEST)}"
-        for notice in news
-    ]
-    lines = [
-        *lines[:_MOST_NOTICES],
-        *([f"and {len(lines) - _MOST_NOTICES} more"] * (len(lines) > _MOST_NOTICES)),
-    ]
-    lines += [f"as before: {as_before}, reported already"] * bool(as_before)
-    subject = f"slip: {', '.join(counts)} ({make_plain(results.absolute().name)})"
-    return subject, [*lines, "", *map(make_plain, report)]
-
-
-def call_command(command: str, subject: str, lines: Sequence[str], *, code: int, results: Path) -> None:
-    """Give a message to a command of the user.
-
-    The message is its standard input; ``SLIP_SUBJECT``, ``SLIP_CODE`` (the exit code), ``SLIP_RESULTS`` and
-    ``SLIP_JSON`` (``{"text": subject and message}``, as chats take it) are in its environment.
-
-    Raises:
-        BatchError: ``notify_failed``.
-    """
-    text = "\n".join([*lines, ""])
-    variables = {
-        "SLIP_SUBJECT": subject,
-        "SLIP_CODE": str(code),
-        "SLIP_RESULTS": str(results.absolute()),
-        "SLIP_JSON": json.dumps({"text": f"{subject}\n{text}"}),
+    raised = {
+        f"{line.path} {line.code or line.reason}": f"{line.path}: {line.reason}"
+        for line in outcome.lines
+        if line.state in _SHORT or line.lossy or line.refused
     }
+    raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
+    notes = Store(root).notes("batch/notified")
+    told = notes.read("sent") or {}
+    notes.write("sent", {about: text for about, text in raised.items() if about in told})
+    return {about: text for about, text in raised.items() if about not in told}
+
+
+def tell(root: Path, command: str, content: Mapping[str, object], news: Mapping[str, str]) -> None:
+    """Give a command the JSON of a batch on its standard input; what was told is not news after the next.
+
+    Args:
+        root: the results.
+        command: a line for the shell.
+        content: the JSON.
+        news: what is new in it.
+
+    Raises:
+        BatchError: ``notify_failed``; the next batch tells it again.
+    """
     try:
         done = subprocess.run(  # noqa: S602 - the user's own command line, which a shell is to read
             command,
             shell=True,
-            input=text,
-            text=True,
-            encoding="utf-8",
-            errors="backslashreplace",
-            env={**os.environ, **variables},
+            input=json.dumps(content).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             timeout=_NOTIFY_S,
             check=False,
         )
-        last = make_plain(next(iter(done.stdout.strip().splitlines()[-1:]), ""))
-        said = f": {shorten(last, _LONGEST)}" if last else ""
-        why = f"it ended with exit code {done.returncode}{said}" if done.returncode else ""
+        last = make_plain(done.stdout.decode("utf-8", "backslashreplace").strip().rpartition("\n")[2])
+        why = f"it ended with exit code {done.returncode}: {shorten(last)}" if done.returncode else ""
     except subprocess.TimeoutExpired:
         why = f"it took longer than {_NOTIFY_S:g} s"
     if why:
-        hint = "The message is sent again after the next batch"
+        hint = "The same is told again after the next batch"
         raise BatchError("notify_failed", f"the command of --notify failed: {why}", where=command, hint=hint)
+    notes = Store(root).notes("batch/notified")
+    notes.write("sent", {**(notes.read("sent") or {}), **news})

@@ -25,7 +25,7 @@ from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, limit_memory, measure
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
-    from pipeline.store import Mirror, Store
+    from pipeline.store import Store
 
 CLEAN = 0
 FAILED = 1
@@ -270,7 +270,15 @@ def refuse_json(words: Sequence[str], error: SlipError) -> None:
         sys.stdout.write(json.dumps(content) + "\n")
 
 
-Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]
+def _require_local(_kind: object, results: Path) -> None:
+    """Refuse an address such as ``s3://bucket/results`` as the folder of results."""
+    if re.match(r"[a-z][a-z0-9+]+:/", str(results)):
+        what = "results are in a folder of this machine, and this is an address"
+        hint = "Give a folder, and copy it with the tool of the object store, for example `aws s3 sync`"
+        raise SlipError("results_not_local", what, where=str(results), hint=hint)
+
+
+Results: TypeAlias = Annotated[Path, Parameter(help="results folder", validator=_require_local)]
 
 All: TypeAlias = Annotated[bool, Parameter(name="--all", negative=())]
 """Whether to show the whole summary, or only the verdict, the main effects and the remaining error."""
@@ -362,48 +370,17 @@ def _list_overrides(choices: Choices) -> Mapping[str, object]:
     return given_again
 
 
-@dataclass(frozen=True)
-class ResultsLocation:
-    """Where results are.
-
-    Attributes:
-        root: their folder, or that of their mirror.
-        mirror: the mirror; None for a folder.
-    """
-
-    root: Path
-    mirror: Mirror | None = None
-
-    def open_store(self) -> Store:
-        """The results, with the newest index where they are on an object store.
-
-        Raises:
-            StoreError: ``no_results``, there is no such folder; or the object store does not answer.
-        """
-        from pipeline.store import Store, no_results  # noqa: PLC0415 - heavy
-
-        if self.mirror is None:
-            if not self.root.is_dir():
-                raise no_results(self.root)
-            return Store(self.root)
-        self.mirror.pull_index()
-        return self.mirror.store
-
-
-def open_results(results: Path) -> ResultsLocation:
-    """Results at a path, or at an address such as ``s3://bucket/results``.
+def open_results(results: Path) -> Store:
+    """The results in a folder.
 
     Raises:
-        StoreError: ``no_object_store``.
+        StoreError: ``no_results``, there is no such folder.
     """
-    from pipeline.logs import RemotePath, to_location  # noqa: PLC0415 - verbs that only help need none
-    from pipeline.store import Mirror  # noqa: PLC0415 - likewise
+    from pipeline.store import Store, no_results  # noqa: PLC0415 - verbs that only help need none
 
-    location = to_location(results)
-    if not isinstance(location, RemotePath):
-        return ResultsLocation(location)
-    mirror = Mirror(str(location))
-    return ResultsLocation(mirror.store.root, mirror)
+    if not results.is_dir():
+        raise no_results(results)
+    return Store(results)
 
 
 def format_vehicle_source(source: str) -> str:

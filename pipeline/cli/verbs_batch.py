@@ -1,18 +1,15 @@
-"""The batch: the logs of a folder, what is new afterwards, and recipes that run it every night."""
+"""The batch: the logs of a folder, and what is new afterwards."""
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pipeline import datasets
 from pipeline.batch import (
     Pruning,
     Request,
@@ -20,9 +17,7 @@ from pipeline.batch import (
     parse_shard,
     parse_size,
 )
-from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
-    ALERT,
     CLEAN,
     EXPLAINED,
     FAILED,
@@ -39,65 +34,15 @@ from pipeline.cli.conventions import (
     print_lines,
     summarize_error,
 )
-from pipeline.core import SlipError, align_rows, measure_memory, slip_command
+from pipeline.core import SlipError, measure_memory
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Line, Outcome
-    from pipeline.batch.notices import Looked, Notice
-    from pipeline.models import ModelFile
 
 _MEMORY_SHARE = 0.8
 
 
-def build_batch() -> App:
-    """The command, which brings results up to date by itself, and its own commands."""
-    app = App(name="batch", help="Analyze the new and changed logs of a folder.")
-    app.default(run)
-    app.command(run)
-    app.command(schedule)
-    return app
-
-
-@dataclass(frozen=True, kw_only=True)
-class Afterwards:
-    """What a batch does after its logs, and which command it notifies.
-
-    A command line of `notify` gets the message on its standard input and in its environment.
-    """
-
-    trend: Annotated[
-        bool, Parameter(help="follow the trend over dates afterwards, as `slip fleet trend` did last")
-    ] = False
-    check: Annotated[
-        tuple[Path, ...],
-        Parameter(help="a baseline or model file; new runs of its vehicle are checked against it"),
-    ] = ()
-    limits: Annotated[Path | None, Parameter(help="file of limits for --check (check.toml)")] = None
-    notify: Annotated[
-        str | None,
-        Parameter(
-            help="command line for the shell that gets new failures and alerts: the message on its "
-            "standard input, and $SLIP_SUBJECT, $SLIP_JSON"
-        ),
-    ] = None
-
-    def open_references(self) -> tuple[dict[str, ModelFile | datasets.Baseline], datasets.Limits | None]:
-        """The baselines by name, and the limits."""
-        if self.limits is not None and not self.check:
-            raise SlipError(
-                "limits_alone",
-                "--limits does nothing by itself",
-                hint="Add --check BASELINE, or leave it out",
-            )
-        if not self.check:
-            return {}, None
-        from pipeline.batch.notices import open_reference  # noqa: PLC0415 - heavy
-
-        opened = {str(path): open_reference(path) for path in self.check}
-        return opened, None if self.limits is None else datasets.read_limits(self.limits)
-
-
-def run(  # noqa: D417 - the shared choices document themselves
+def batch(  # noqa: D417 - the shared choices document themselves
     logs: Annotated[
         list[str] | None,
         Parameter(help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash"),
@@ -105,7 +50,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
-    afterwards: Annotated[Afterwards, Parameter(name="*")] = Afterwards(),
+    notify: str | None = None,
     jobs: PositiveInt | None = None,
     executor: str = "local",
     shard: str | None = None,
@@ -124,8 +69,8 @@ def run(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Analyze the new and changed logs of a folder.
 
-    The same command again continues. Exit codes: 0 all done; 1 a log or a step failed; 4 an alert of --trend
-    or --check; 3 done, but a log had losses, cannot show slip, or could not be looked at.
+    The same command again continues. Exit codes: 0 all done; 1 a log or a step failed; 3 done, but a log had
+    losses, cannot show slip, or could not be looked at.
 
     Args:
         jobs: logs processed in parallel (default: the cores it may use).
@@ -140,6 +85,8 @@ def run(  # noqa: D417 - the shared choices document themselves
         prune: remove old generations afterwards; without logs, only that.
         keep: old generations to keep of each run.
         quota: with --prune, size of the results above which the oldest go first, for example 200GB.
+        notify: command line for the shell that gets the JSON object on its standard input when something is
+            new: a log that failed, had losses or cannot show slip, or another error.
         json: print one JSON object.
         quiet: print nothing but errors.
     """
@@ -151,14 +98,12 @@ def run(  # noqa: D417 - the shared choices document themselves
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
-    opened = open_results(choices.results)
     if not logs:
-        opened.open_store()
+        open_results(choices.results)
     workers = jobs or count_cores()
     request = Request(
         targets=tuple(logs or ()),
-        options=replace(options, out=opened.root, config=None, fleet=options.config),
-        address=None if opened.mirror is None else opened.mirror.address,
+        options=replace(options, config=None, fleet=options.config),
         executor=executor,
         jobs=workers,
         shard=None if shard is None else parse_shard(shard),
@@ -170,93 +115,53 @@ def run(  # noqa: D417 - the shared choices document themselves
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,
     )
-    from pipeline.batch.batch_run import run_batch  # noqa: PLC0415 - heavy
+    from pipeline.batch.batch_run import Outcome, run_batch  # noqa: PLC0415 - heavy
 
     try:
-        references = afterwards.open_references()
         with open_watch(quiet=quiet or json) as watch:
             outcome = run_batch(request, watch)
     except Exception as error:
         # No logs, a full disk: nobody looks at the screen of a night.
-        if afterwards.notify is not None:
-            from pipeline.batch.notices import note_error, send_news  # noqa: PLC0415 - heavy
-
-            send_news(opened.root, afterwards.notify, [note_error(error)], [], code=FAILED)
+        what = error if isinstance(error, SlipError) else SlipError("unexpected_error", repr(error), hint="")
+        _tell(Outcome(lines=(), seconds=0.0, problems=(what,)), choices.results, notify)
         raise
-    lines = format_outcome(outcome, is_search=bool(logs))
-    after = _look_after(outcome, opened.root, afterwards, references, lines)
-    for problem in (*outcome.problems, *after.problems):
+    for problem in outcome.problems:
         print_error(problem)
+    outcome = _tell(outcome, choices.results, notify)
     if json:
-        print_json(_as_json(outcome, after))
+        print_json(_as_json(outcome))
     elif not quiet:
-        print_lines([*lines, *after.lines])
-    return after.code
+        print_lines(format_outcome(outcome, is_search=bool(logs)))
+    return FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
 
 
-@dataclass(frozen=True)
-class _After:
-    """What came after the logs: lines for the screen, exit code, what was sent, and why it was not."""
-
-    code: int
-    looked: Sequence[Looked] = ()
-    news: Sequence[Notice] = ()
-    problems: Sequence[SlipError] = ()
-
-    @property
-    def lines(self) -> list[str]:
-        pairs = [pair for one in self.looked for pair in one.lines]
-        return [*([""] * bool(pairs)), *align_rows(pairs)]
-
-
-def _look_after(
-    outcome: Outcome,
-    root: Path,
-    afterwards: Afterwards,
-    references: tuple[Mapping[str, ModelFile | datasets.Baseline], datasets.Limits | None],
-    lines: Sequence[str],
-) -> _After:
-    code = FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
-    if afterwards == Afterwards():
-        return _After(code)
+def _tell(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
+    """The outcome with what is new in it, which the command of ``--notify`` was given, or why it was not."""
     from pipeline.batch import notices  # noqa: PLC0415 - heavy
 
-    looked = [notices.look_at_trend(root)] if afterwards.trend else []
-    looked += [
-        notices.look_at_new_runs(outcome, root, name, known, references[1])
-        for name, known in references[0].items()
-    ]
-    raised = [*notices.list_failures(outcome), *(each for one in looked for each in one.notices)]
-    if any(not each.is_alert for each in raised):
-        code = FAILED
-    elif raised:
-        code = ALERT
-    after = _After(code, looked)
-    if afterwards.notify is None:
-        return after
+    if notify is None:
+        return outcome
+    news = notices.find_news(root, outcome)
+    told = replace(outcome, notified=tuple(news.values()))
     try:
-        # The counts alone: the notices say which logs failed.
-        counts = lines[: lines.index("")] if "" in lines else lines
-        report = [*counts, *after.lines, "", f"page    {root.absolute() / 'index.html'}"]
-        news = notices.send_news(root, afterwards.notify, raised, report, code=code)
+        if news:
+            notices.tell(root, notify, _as_json(told), news)
     except SlipError as error:
-        return replace(after, code=FAILED, problems=[error])
-    return replace(after, news=news)
+        print_error(error)
+        return replace(outcome, problems=(*outcome.problems, error))
+    return told
 
 
-def _as_json(outcome: Outcome, after: _After) -> dict[str, object]:
+def _as_json(outcome: Outcome) -> dict[str, object]:
     states = [line.state for line in outcome.lines]
-    raised = [each for one in after.looked for each in one.notices]
     return {
         **outcome.counts,
         **{name: states.count(name) for name in ("growing", "left", "skipped")},
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
-        "after": [{"what": label, "text": text} for one in after.looked for label, text in one.lines],
-        "alerts": [each.text for each in raised if each.is_alert],
-        "notified": [each.text for each in after.news],
-        "errors": [summarize_error("", problem) for problem in (*outcome.problems, *after.problems)],
+        "notified": list(outcome.notified),
+        "errors": [summarize_error("", problem) for problem in outcome.problems],
     }
 
 
@@ -265,10 +170,6 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     states = Counter(line.state for line in outcome.lines)
     rare = {state: states[state] for state in ("growing", "left", "skipped") if states[state]}
     lines = format_counts({**outcome.counts, **rare}, width=6)
-    fetched = sum(line.fetched_bytes for line in outcome.lines)
-    if fetched:
-        whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
-        lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     noted = [(_list_notes(line), (line.path, line.reason, line.hint)) for line in outcome.lines]
@@ -282,47 +183,3 @@ def _list_notes(line: Line) -> list[str]:
     """State of a log, and notes on results that did not change."""
     notes = {"refused": line.refused, "lossy": line.lossy}
     return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]
-
-
-def schedule(  # noqa: D417 - arguments document themselves
-    *arguments: Annotated[
-        str, Parameter(help="what follows `slip batch`: logs and options", allow_leading_hyphen=True)
-    ],
-    print: Annotated[System, Parameter(name="--print")] = "systemd",  # noqa: A002 - the promised name
-    at: Annotated[str, Parameter(name="--at")] = "02:00",
-    lock: Annotated[Path | None, Parameter(name="--lock")] = None,
-    trend: Annotated[bool, Parameter(name="--trend", negative="--no-trend")] = True,
-    notify: Annotated[str | None, Parameter(name="--notify")] = None,
-) -> int:
-    """Print a recipe that runs `slip batch` every night.
-
-    Runs never overlap. With systemd and cron, nights that the machine slept through are made up for, and the
-    journal has what was printed.
-
-    Args:
-        print: systemd (a service and its timer), cron, airflow (a DAG) or github (a workflow of its Actions).
-        at: time of day; local for systemd and cron, UTC for the others.
-        trend: follow the trend over dates after each batch.
-        notify: command line for the shell that gets new failures and alerts.
-        lock: lock file (default: .slip-batch.lock in this folder).
-    """
-    hour, minute = parse_clock(at)
-    # A misspelt option would fail every night, where nobody looks.
-    try:
-        build_batch().parse_args(list(arguments), exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        why = str(error).strip().partition(". ")[0].rstrip(".")
-        what = f"slip batch does not take what would be run every night: {why}"
-        raise SlipError("usage", what, hint="It takes the folders and options of `slip batch`.") from error
-    folder = Path.cwd()
-    nightly = Nightly(
-        program=slip_command(),
-        arguments=(*(["--trend"] if trend else []), *arguments),
-        folder=folder,
-        lock=(folder / (lock or ".slip-batch.lock")),
-        hour=hour,
-        minute=minute,
-        notify=notify,
-    )
-    sys.stdout.write(print_units(nightly, print))
-    return CLEAN

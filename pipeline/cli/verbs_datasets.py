@@ -298,7 +298,7 @@ def draw(  # noqa: D417 - arguments document themselves
     if cell is not None:
         raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
-    store = Store(results) if results == Path("results") else open_results(results).open_store()
+    store = Store(results) if results == Path("results") else open_results(results)
     features = None if shared is None else datasets.read_features(shared)
     drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)
@@ -330,7 +330,7 @@ def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: b
     """Write the terrain map of slip by position."""
     from pipeline.report.fleet_pages import write_terrain  # noqa: PLC0415 - heavy
 
-    store = open_results(results).open_store()
+    store = open_results(results)
     drawn = datasets.draw_up_terrain(store, cell_m=datasets.CELL_M if cell is None else cell, fed=fed)
     written = write_terrain(store, drawn)
     content = {

@@ -1,4 +1,4 @@
-"""Commands on results: status, verify, explain, query."""
+"""Commands on results: status, verify, query."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pipeline.cli.conventions import (
     summarize_error,
     tidy_line,
 )
-from pipeline.core import INPUT_WORDS, SlipError, format_count, format_size, guess_names
+from pipeline.core import INPUT_WORDS, SlipError, format_count, format_size
 
 if TYPE_CHECKING:
     import polars as pl
@@ -46,8 +46,8 @@ def build_results() -> App:
     """The command and its own commands."""
     from pipeline.cli.verbs_log import stage  # noqa: PLC0415 - only for this command
 
-    app = App(name="results", help="Check, explain and query a folder of results.")
-    for command in (status, verify, explain, query, stage):
+    app = App(name="results", help="Check and query a folder of results.")
+    for command in (status, verify, query, stage):
         app.command(command)
     return app
 
@@ -79,12 +79,7 @@ def query(  # noqa: D417 - arguments document themselves
     from pipeline.store import Partition  # noqa: PLC0415 - heavy
 
     partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
-    opened = open_results(results)
-    store = opened.open_store()
-    if opened.mirror is not None:
-        words = re.findall(r"\w+", sql.lower())
-        opened.mirror.pull_tables(words, partition.select(store.manifests()))
-    answer = store.query(sql, partition)
+    answer = open_results(results).query(sql, partition)
     if as_json or to == "json":
         _print_json(answer)
     elif to == "csv":
@@ -150,18 +145,28 @@ def _spell(value: object) -> object:
 
 
 def status(  # noqa: D417 - arguments document themselves
-    results: Results = Path("results"),
+    run: Annotated[
+        str | None, Parameter(help="name of a run, or its log: what its numbers were computed from")
+    ] = None,
+    /,
     *,
+    results: Results = Path("results"),
     json: bool = False,
 ) -> int:
-    """Show the state of all logs, and the size of the results.
+    """Show the state of all logs, or the log, configuration and corrections behind the numbers of one run.
 
     Args:
         json: print one JSON object.
     """
     from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
+    from pipeline.store import find_run  # noqa: PLC0415 - heavy
 
-    status_now = read_status(open_results(results).open_store())
+    store = open_results(results)
+    if run is not None:
+        manifest = find_run(run, store)
+        content = {"run": manifest.run, "key": manifest.key, **manifest.details}
+        return print_result(content, lambda: _format_origin(manifest), json=json)
+    status_now = read_status(store)
     print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
     return FAILED if status_now.errors else CLEAN
 
@@ -227,12 +232,10 @@ def verify(  # noqa: D417 - arguments document themselves
     from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
 
     drawn = parse_sample(sample, seed)
-    opened = open_results(results)
-    store = opened.open_store()
+    store = open_results(results)
     with show_progress("verify", quiet=quiet or json) as notify:
         verification = verify_results(
             store,
-            mirror=opened.mirror,
             logs=logs,
             notify=notify,
             repair=repair,
@@ -324,115 +327,6 @@ def _format_check(verification: Verification) -> list[str]:
     return lines
 
 
-def explain(  # noqa: D417 - arguments document themselves
-    run: Annotated[str, Parameter(help="name of a run, or its log")],
-    number: Annotated[
-        str | None, Parameter(help="a column (slip.modulus) or an effect: what it is, and where it stands")
-    ] = None,
-    /,
-    *,
-    results: Results = Path("results"),
-    json: bool = False,
-) -> int:
-    """Show the log and configuration behind a run's numbers, or what one number is.
-
-    Args:
-        json: print one JSON object.
-    """
-    from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
-
-    manifest = find_run(run, Store(results))
-    content = {"run": manifest.run, "key": manifest.key, **manifest.details, "column": None}
-    if number is None:
-        return print_result(content, lambda: _format_origin(manifest), json=json)
-    if effect := _explain_effect(number, manifest):
-        return print_result(content | {"effect": number}, lambda: effect, json=json)
-    column = _find_column(number, manifest)
-    content["column"] = _list_column(column)
-    return print_result(content, lambda: _explain_column(column, manifest), json=json)
-
-
-def _explain_effect(name: str, manifest: Manifest) -> list[str]:
-    """What an effect of the diagnosis is, its numbers and their evidence; empty where it is none of them."""
-    from pipeline.estimation.stored_diagnosis import read_stored_diagnosis  # noqa: PLC0415 - heavy
-    from pipeline.words import describe_motion, format_short, list_largest_falls  # noqa: PLC0415 - heavy
-
-    run = read_stored_diagnosis(manifest)
-    effect = next(
-        (one for one in (() if run is None else run.effects) if one.id == name.partition(".")[0]), None
-    )
-    if run is None or effect is None:
-        return []
-    fall = list_largest_falls(run).get(effect.id, "")
-    return [
-        f"number    {effect.id}: {format_short(effect)} [95 % interval]",
-        f"meaning   {describe_motion(effect, run)}",
-        f"evidence  error over 2 s {fall}, on data that the fit has not seen" if fall else "",
-        *_locate(manifest, "parameters"),
-        f"formula   slip effects {effect.id}",
-    ]
-
-
-def _find_column(name: str, manifest: Manifest) -> str:
-    """A column as table.column, which a name alone stands for where one table of the run has it.
-
-    Raises:
-        SlipError: ``no_such_column``.
-    """
-    from schemas import list_contracts  # noqa: PLC0415 - heavy
-
-    known = {f"{one.name}.{column}" for one in list_contracts() for column in one.schema.columns()}
-    if name in known:
-        return name
-    fitting = [each for each in sorted(known) if each.endswith(f".{name}")]
-    if here := [each for each in fitting if each.partition(".")[0] in manifest.tables]:
-        fitting = here
-    if len(fitting) == 1:
-        return fitting[0]
-    what = f"several tables have the column {name!r}" if fitting else f"no table has the column {name!r}"
-    near = f"Say which of: {', '.join(fitting)}." if fitting else guess_names(name, sorted(known)).strip()
-    hint = near or f"Give an effect of this run, or table.column of {', '.join(sorted(manifest.tables))}."
-    raise SlipError("no_such_column", what, hint=hint)
-
-
-def _explain_column(column: str, manifest: Manifest) -> list[str]:
-    """What a column is, and what this run has in it."""
-    table, _, name = column.partition(".")
-    about = _list_column(column)
-    unit, frame = about.get("unit", "1"), about.get("frame")
-    lines = [
-        f"number    {column}{'' if unit == '1' else f' [{unit}]'}{f', frame {frame}' if frame else ''}",
-        f"meaning   {about.get('description', '')}",
-    ]
-    if table not in manifest.tables:
-        return [*lines, f"table     this run has no {table}"]
-    values = manifest.read(table)[name]
-    if values.dtype.is_float() and (known := values.drop_nulls()).len():
-        ends = (known.median(), known.min(), known.max())
-        lines.append("values    median {:.4g}, from {:.4g} to {:.4g}".format(*ends))
-    return [*lines, *_locate(manifest, table)]
-
-
-def _locate(manifest: Manifest, table: str) -> list[str]:
-    """Where a table stands, and of what it was made."""
-    stored, log = manifest.tables.get(table), manifest.part("log")
-    rows = [] if stored is None else [f"table     {manifest.folder}/{table}.parquet, {stored.rows} rows"]
-    program = manifest.part("versions").get("slip-pipeline")
-    return [
-        *rows,
-        f"log       {log.get('path')}",
-        f"          SHA-256 {log.get('sha256')}, by slip {program}",
-    ]
-
-
-def _list_column(column: str) -> dict[str, str]:
-    """Unit, frame and description of a column that is there, from its contract."""
-    from schemas import list_contracts  # noqa: PLC0415 - heavy
-
-    table, _, name = column.partition(".")
-    return next(one for one in list_contracts() if one.name == table).metadata_of(name)
-
-
 def _format_origin(manifest: Manifest) -> list[str]:
     details = manifest.details
     log = manifest.part("log")
@@ -453,7 +347,8 @@ def _format_origin(manifest: Manifest) -> list[str]:
     for table, stored in sorted(manifest.tables.items()):
         quarantined = f", {stored.quarantined} in quarantine" if stored.quarantined else ""
         contract = f"contract {stored.contract_version}"
-        lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {stored.sha256[:16]}")
+        digest = manifest.files[f"{table}.parquet"].sha256[:16]
+        lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {digest}")
     lines.append("configuration")
     lines.append("  " + json.dumps(_without_defaults(manifest.part("configuration"))))
     return lines
@@ -465,22 +360,24 @@ def _format_alignment(manifest: Manifest) -> list[str]:
         return []
     import polars as pl  # noqa: PLC0415 - takes a fifth of a second
 
+    from schemas import contract_of  # noqa: PLC0415 - likewise
+
     row = manifest.read("alignments").row(0, named=True)
+    about = contract_of("alignments")
     lines = [
         "aligned        (table alignments; latency, outlier, *_aligned: columns of poses, wheels, commands)"
     ]
     for name, value in row.items():
         if isinstance(value, float):
-            unit = _list_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
+            unit = about.metadata_of(name).get("unit", "1").removesuffix("1")
             lines.append(f"  {name:<25}{value:.6g} {unit}".rstrip())
     aggregates = manifest.read("aggregates").filter(pl.col("subset") == "all")
-    for name, before, now in aggregates.select(
-        "input", "median_recorded_modulus", "median_modulus"
-    ).iter_rows():
-        if before is not None:
-            lines.append(
-                f"  slip {INPUT_WORDS[name]:<20}{before:.4g} m/s as recorded, {now:.4g} m/s aligned (medians)"
-            )
+    medians = aggregates.select("input", "median_recorded_modulus", "median_modulus")
+    lines += [
+        f"  slip {INPUT_WORDS[name]:<20}{before:.4g} m/s as recorded, {now:.4g} m/s aligned (medians)"
+        for name, before, now in medians.iter_rows()
+        if before is not None
+    ]
     return lines
 
 

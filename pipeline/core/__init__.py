@@ -54,7 +54,7 @@ if TYPE_CHECKING:
         list_caches,
         require_compiler,
     )
-    from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory, read_memory
+    from pipeline.core.memory import limit_memory, measure_memory, read_memory
     from pipeline.core.processes import (
         PACKAGE,
         end_with,
@@ -64,7 +64,6 @@ if TYPE_CHECKING:
         read_version,
         require_package,
         silence_warnings,
-        slip_command,
     )
     from pipeline.core.rigid import (
         GRAVITY_MPS2,

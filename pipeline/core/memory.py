@@ -1,7 +1,6 @@
 """Memory of processes and of the machine, and its limits."""
 
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -18,50 +17,6 @@ _PROC = Path("/proc/self/task")
 
 _SLOW_PERIOD_S = 1.0
 """Polling period where another program must be called for the list of processes [s]."""
-
-
-class MemoryWatchdog:
-    """Kills child processes that exceed a memory limit.
-
-    A child that has not yet started its program shares the memory of this process: only processes known to
-    run are watched.
-
-    Args:
-        limit_bytes: memory limit of each process.
-    """
-
-    def __init__(self, limit_bytes: int) -> None:
-        self._limit = limit_bytes
-        self._watched: frozenset[int] = frozenset()
-        self._killed: dict[int, int] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
-
-    def start(self) -> None:
-        """Start watching in a separate thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop watching."""
-        self._stop.set()
-        self._thread.join()
-
-    def watch(self, pid: int) -> None:
-        """Watch a child process, which runs its own program."""
-        self._watched |= {pid}
-
-    def held_by(self, pid: int) -> int | None:
-        """Memory of a process when it was killed for it [bytes]; None if it was not."""
-        return self._killed.get(pid)
-
-    def _watch(self) -> None:
-        while not self._stop.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
-            for pid in self._watched.intersection(list_children()):
-                held = read_memory(pid)
-                if held > self._limit and pid not in self._killed:
-                    self._killed[pid] = held
-                    with suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
 
 
 @contextmanager
@@ -87,19 +42,6 @@ def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[N
     finally:
         done.set()
         watcher.join()
-
-
-def list_children() -> list[int]:
-    """Running child processes of this process."""
-    if not _PROC.exists():
-        asked = _ask(["/usr/bin/pgrep", "-P", str(os.getpid())])
-        return [int(word) for word in asked.split()]
-    children: list[int] = []
-    for path in _PROC.glob("*/children"):
-        # A thread may end between listing the folder and reading the file.
-        with suppress(OSError):
-            children += [int(word) for word in path.read_bytes().split()]
-    return children
 
 
 def read_memory(pid: int) -> int:

@@ -72,18 +72,9 @@ def python_command(*words: str) -> list[str]:
     """Command line of this interpreter, by its absolute path, without the current folder in its import path.
 
     Args:
-        words: arguments, such as ``-m pipeline batch``.
+        words: arguments, such as ``-m pipeline.live.receiver``.
     """
     return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
-
-
-def slip_command(*words: str) -> list[str]:
-    """Command line of a verb in a process of its own.
-
-    Args:
-        words: the verb and its arguments.
-    """
-    return python_command("-m", "pipeline", *words)
 
 
 def keep_current_folder_out() -> None:

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pipeline.core import naming_os_errors, pick, pick_finite, slip_command
+from pipeline.core import naming_os_errors, pick, pick_finite, python_command
 from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.driving_need import find_goal
 from pipeline.logs import LogError, is_finished, list_files
@@ -112,7 +112,9 @@ def follow(path: Path, arguments: Sequence[str], *, every_s: float, quiet_s: flo
 
 def _analyze(path: Path, arguments: Sequence[str]) -> dict[str, Any]:
     """The run's object of `slip analyze`, or one with a ``problem``."""
-    command = slip_command("analyze", "--json", "--no-report", *arguments, "--", str(path))
+    command = python_command(
+        "-m", "pipeline", "analyze", "--json", "--no-report", *arguments, "--", str(path)
+    )
     output = None
     # The robot's own processes go first.
     with subprocess.Popen(  # noqa: S603 - this program itself

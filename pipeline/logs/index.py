@@ -286,7 +286,9 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
                 hint="Put it back from where it was recorded, or remove it: the files are then found by name",
             )
         listed = [
-            name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(SUFFIXES)
+            name
+            for name in _listed_files(listing.read_bytes().decode("utf-8", "replace"))
+            if name.endswith(SUFFIXES)
         ]
         named = {
             name: next(filter(None, (_find_listed(path, f"{name}{end}") for end in ("", *COMPRESSED))), None)

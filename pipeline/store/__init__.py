@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         temporary_beside,
     )
     from pipeline.store.generation import STEPS, Generation
-    from pipeline.store.mirror import Mirror
     from pipeline.store.names import (
         Sample,
         StoreError,

@@ -1,4 +1,4 @@
-"""Small JSON files with a checksum of their own: the manifest of a run, markers of generations, and notes."""
+"""Small JSON files with a checksum of their own: the manifest of a run, and notes."""
 
 import json
 import os
@@ -114,56 +114,26 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
 
     path = home / MANIFEST
     try:
-        try:
-            stored = msgspec.json.decode(data, type=_Stored)
-            written_in = stored.format
-        except msgspec.ValidationError:
-            written_in = msgspec.json.decode(data, type=_Header).format
-            if written_in <= FORMAT:
-                raise
-        if written_in <= FORMAT:
-            _check_names(stored)
-            check_checksum(data)
-            folder = resolve_inside(home, stored.folder)
+        written_in = msgspec.json.decode(data, type=_Header).format
+        if written_in > FORMAT:
+            raise StoreError(
+                "manifest_too_new",
+                f"the results are in format {written_in}, this version reads up to {FORMAT}",
+                where=str(path),
+                hint="Use the newer version, or another folder with --results",
+            )
+        stored = msgspec.json.decode(data, type=_Stored)
+        _check_names(stored)
+        check_checksum(data)
+        folder = resolve_inside(home, stored.folder)
     except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
         said = error.what if isinstance(error, PathError) else " ".join(str(error).split())
         hint = "Delete this one file and analyze its log again"
         raise StoreError(
             "manifest_damaged", f"the manifest is damaged ({said})", where=str(path), hint=hint
         ) from error
-    if written_in > FORMAT:
-        raise StoreError(
-            "manifest_too_new",
-            f"the results are in format {written_in}, this version reads up to {FORMAT}",
-            where=str(path),
-            hint="Use the newer version, or another folder with --results",
-        )
     content = {key: value for key, value in vars(stored).items() if key != "format"}
     return Manifest(**content | {"folder": folder})
-
-
-def encode_marker(run: str, files: Mapping[str, str]) -> bytes:
-    """What stands in a generation's own folder: its files, for when no manifest names them any more.
-
-    Args:
-        run: the run.
-        files: SHA-256 of the files by name.
-    """
-    return encode_checked({"run": run, "files": files})
-
-
-def parse_marker(data: bytes) -> dict[str, str]:
-    """SHA-256 of a generation's files by name, as its marker tells them.
-
-    Raises:
-        ValueError: the marker is damaged.
-    """
-    files = decode_checked(data).get("files")
-    if not isinstance(files, dict) or not all(
-        is_file_name(name) and isinstance(sha256, str) for name, sha256 in files.items()
-    ):
-        raise ValueError("it does not list the files")
-    return files
 
 
 @dataclass(frozen=True)
@@ -188,9 +158,9 @@ def _check_names(stored: _Stored) -> None:
     for name in (stored.folder, *stored.earlier, *stored.tables, *stored.files):
         if not is_file_name(name) or ("/" in name and name not in stored.files):
             raise ValueError(f"it names {name!r}")
-    for table, entry in stored.tables.items():
-        if entry.file != f"{table}.parquet":
-            raise ValueError(f"it names {entry.file!r} for the table {table!r}")
+    for table in stored.tables:
+        if f"{table}.parquet" not in stored.files:
+            raise ValueError(f"it names no file for the table {table!r}")
     if not is_key(stored.key):
         raise ValueError(f"its key is {stored.key!r}")
 
@@ -202,7 +172,7 @@ def _check_names(stored: _Stored) -> None:
 # into a generation.
 
 LOG_NOTES = "batch/logs"
-"""Folder of the notes on logs, the only ones that several machines share."""
+"""Folder of the notes on logs."""
 
 
 NOTES = ("batch/", "identities/")

@@ -281,23 +281,17 @@ class FileEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class TableEntry:
-    """A table of a generation.
+    """A table of a generation, in the file ``<table>.parquet``.
 
     Attributes:
-        file: name of the Parquet file in the generation's folder.
         rows: rows that keep the contract.
         quarantined: rows that break it; they stand in ``quarantine_<table>.parquet``.
-        sha256: of the file, in hexadecimal.
-        bytes: size of the file.
         contract_version: version of the contract it was written under.
         rules: how many rows broke each rule.
     """
 
-    file: str
     rows: int
     quarantined: int
-    sha256: str
-    bytes: int
     contract_version: int
     rules: Mapping[str, int] = field(default_factory=dict)
 
@@ -311,7 +305,7 @@ class Manifest:
         key: key of the generation, as given by the writer.
         folder: folder of the generation, named by the key, with a number behind it where the key was taken.
         tables: the tables by name.
-        files: all other files by name.
+        files: all files by name, those of the tables included.
         details: what the writer gave with the commit.
         earlier: names of the folders of the generations before this one that are still there, newest first.
     """
@@ -330,14 +324,13 @@ class Manifest:
         Raises:
             StoreError: ``no_such_table``, this generation holds neither; ``file_outside``, a link leads away.
         """
-        if name in self.tables:
-            return join_inside(self.folder, self.tables[name].file)
-        for file in (name, f"{name}.parquet"):
+        for file in (f"{name}.parquet", name):
             if file in self.files:
                 return join_inside(self.folder, file)
         raise StoreError(
             "no_such_table",
-            f"the results of {self.run!r} hold no {name!r}; they hold {', '.join(self.names()) or 'nothing'}",
+            f"the results of {self.run!r} hold no {name!r}; they hold "
+            f"{', '.join(sorted(self.tables)) or 'nothing'}",
             where=str(self.folder),
             hint="Analyze the log again to make it",
         )
@@ -353,25 +346,20 @@ class Manifest:
         """What `read` raises of the first table whose file is of another size; nothing is read.
 
         Args:
-            needed: tables whose files may not be missing either; a mirror has only those that were asked for.
+            needed: tables whose files may not be missing either.
         """
-        for name, entry in self.tables.items():
-            path = self.folder / entry.file
+        for name in self.tables:
+            path = self.folder / f"{name}.parquet"
             if not path.exists():
                 if name in needed:
                     return file_missing(path)
-            elif path.stat().st_size != entry.bytes:
+            elif path.stat().st_size != self.files[path.name].bytes:
                 return table_damaged(NOT_AS_WRITTEN, path)
         return None
 
-    def names(self) -> tuple[str, ...]:
-        """Names of all tables, then of all other files."""
-        return (*sorted(self.tables), *sorted(self.files))
-
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file by its name in the generation's folder, sorted."""
-        tables = {entry.file: entry.sha256 for entry in self.tables.values()}
-        return dict(sorted((tables | {name: entry.sha256 for name, entry in self.files.items()}).items()))
+        return {name: entry.sha256 for name, entry in sorted(self.files.items())}
 
     def read(self, table: str) -> pl.DataFrame:
         """A table of exactly this generation, or the ``quarantine_<table>`` of one.

@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.store import files
-from pipeline.store.checksums import encode_manifest, encode_marker, load_manifest
+from pipeline.store.checksums import encode_manifest, load_manifest
 from pipeline.store.files import (
     JSON,
     MANIFEST,
@@ -153,7 +153,7 @@ class Generation:
         """
         self._require_open()
         before = self._require_table(name)
-        path = self._folder / before.file
+        path = self._folder / f"{name}.parquet"
         checked = check_table(name, frame, read_facts(path))
         if checked.report.rows != before.rows:
             what = f"{name} has {before.rows} rows, and is to be replaced by {checked.report.rows} good ones"
@@ -164,12 +164,8 @@ class Generation:
             path.unlink()
             self._draft(path, data)
         self._watch("file_written")
-        self._tables[name] = replace(
-            before,
-            sha256=hash_bytes(data),
-            bytes=len(data),
-            contract_version=checked.contract.version,
-        )
+        self._files[path.name] = FileEntry(sha256=hash_bytes(data), bytes=len(data))
+        self._tables[name] = replace(before, contract_version=checked.contract.version)
 
     def write_checked(self, checked: CheckedTable) -> TableReport:
         """Write a table that was held against its contract.
@@ -179,16 +175,10 @@ class Generation:
         """
         name = checked.contract.name
         valid, rest = checked.encode()
-        entry = self._write(f"{name}.parquet", valid)
+        self._write(f"{name}.parquet", valid)
         if rest is not None:
-            broken = f"{QUARANTINE}{name}.parquet"
-            self._files[broken] = self._write(broken, rest)
-        self._tables[name] = TableEntry(
-            file=f"{name}.parquet",
-            contract_version=checked.contract.version,
-            **vars(entry),
-            **vars(checked.report),
-        )
+            self._write(f"{QUARANTINE}{name}.parquet", rest)
+        self._tables[name] = TableEntry(contract_version=checked.contract.version, **vars(checked.report))
         return checked.report
 
     @property
@@ -202,7 +192,8 @@ class Generation:
         Raises:
             StoreError: ``no_such_table``, it was neither written nor taken over so far.
         """
-        return read_parquet(self._folder / self._require_table(name).file)
+        self._require_table(name)
+        return read_parquet(self._folder / f"{name}.parquet")
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file, UTF-8.
@@ -215,7 +206,7 @@ class Generation:
     def write_bytes(self, name: str, data: bytes) -> None:
         """Write a file; errors as of `write_text`."""
         check_file_name(name)
-        self._files[name] = self._write(name, data)
+        self._write(name, data)
 
     def reuse_table(self, name: str) -> TableReport:
         """Take a table, and its quarantine, over from the previous generation unchanged.
@@ -224,15 +215,12 @@ class Generation:
             StoreError: ``no_such_table`` when the previous generation has none; ``file_missing`` or
                 ``file_damaged`` when what is there is not what was written.
         """
-        previous = self._require_previous(name)
-        if name not in previous.tables:
+        entry = None if self.previous is None else self.previous.tables.get(name)
+        if self.previous is None or entry is None:
             raise self._nothing_to_reuse(name)
-        entry = previous.tables[name]
-        self._link(entry.file, entry.sha256)
-        broken = f"{QUARANTINE}{name}.parquet"
-        if broken in previous.files:
-            self._link(broken, previous.files[broken].sha256)
-            self._files[broken] = previous.files[broken]
+        self._link(f"{name}.parquet")
+        if (broken := f"{QUARANTINE}{name}.parquet") in self.previous.files:
+            self._link(broken)
         self._tables[name] = entry
         return TableReport(rows=entry.rows, quarantined=entry.quarantined, rules=entry.rules)
 
@@ -242,21 +230,16 @@ class Generation:
         Raises:
             StoreError: as `reuse_table`.
         """
-        previous = self._require_previous(name)
-        if name not in previous.files:
-            raise self._nothing_to_reuse(name)
-        self._link(name, previous.files[name].sha256)
-        self._files[name] = previous.files[name]
+        self._link(name)
 
     def reuse_all(self, *others: str) -> None:
         """Take over all tables and files of the previous generation but the ``others``; as `reuse_table`."""
-        previous = self._require_previous("table")
-        for table in previous.tables:
-            self.reuse_table(table)
-        taken = {f"{QUARANTINE}{table}.parquet" for table in previous.tables}
-        for name in previous.files:
-            if name not in taken.union(others):
-                self.reuse_file(name)
+        if self.previous is None:
+            raise self._nothing_to_reuse("table")
+        for name in self.previous.files:
+            if name not in others:
+                self._link(name)
+        self._tables |= self.previous.tables
 
     def commit(self, details: Mapping[str, JSON]) -> Manifest:
         """Publish the generation: from here on every reader sees it, and nothing of the one before.
@@ -271,7 +254,7 @@ class Generation:
         with name_disk_errors(self._home):
             manifest = self._make_manifest(details)
             data = encode_manifest(manifest)
-            self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes()))
+            self._draft(self._folder / MARKER, b"")
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
             files.sync_files([*self._drafts, *folders, self._folder])
             self._watch("folder_synced")
@@ -316,28 +299,31 @@ class Generation:
             earlier=self._taken() if self._keeps_previous else self._taken()[1:],
         )
 
-    def _write(self, name: str, data: bytes) -> FileEntry:
+    def _write(self, name: str, data: bytes) -> None:
         self._require_new(name)
         path = self._folder / name
         with name_disk_errors(path):
             files.make_folder(path.parent)
             self._draft(path, data)
         self._watch("file_written")
-        return FileEntry(sha256=hash_bytes(data), bytes=len(data))
+        self._files[name] = FileEntry(sha256=hash_bytes(data), bytes=len(data))
 
     def _draft(self, path: Path, data: bytes) -> None:
         files.draft_file(path, data)
         self._drafts.append(path)
 
-    def _link(self, name: str, sha256: str) -> None:
+    def _link(self, name: str) -> None:
         self._require_new(name)
-        source = join_inside(self._require_previous(name).folder, name)
+        entry = None if self.previous is None else self.previous.files.get(name)
+        if self.previous is None or entry is None:
+            raise self._nothing_to_reuse(name)
+        source = join_inside(self.previous.folder, name)
         with name_disk_errors(source):
             try:
                 digest = hash_file(source)
             except FileNotFoundError as error:
                 raise file_missing(source) from error
-            if digest != sha256:
+            if digest != entry.sha256:
                 raise StoreError(
                     "file_damaged",
                     "a file of the results has changed since it was written",
@@ -347,6 +333,7 @@ class Generation:
             files.make_folder((self._folder / name).parent)
             files.link_or_copy(source, self._folder / name)
         self._watch("file_written")
+        self._files[name] = entry
 
     def _require_open(self) -> None:
         if not self._is_open:
@@ -355,8 +342,7 @@ class Generation:
 
     def _require_new(self, name: str) -> None:
         self._require_open()
-        taken = {entry.file for entry in self._tables.values()} | set(self._files)
-        if name in taken:
+        if name in self._files:
             hint = "Write each table and file of a generation once"
             raise self._refuse("written_twice", f"{name} was written already", hint)
 
@@ -365,11 +351,6 @@ class Generation:
             what = f"the generation holds no {name!r} so far"
             raise self._refuse("no_such_table", what, "Run the stage before, or analyze the whole log")
         return self._tables[name]
-
-    def _require_previous(self, name: str) -> Manifest:
-        if self.previous is None:
-            raise self._nothing_to_reuse(name)
-        return self.previous
 
     def _nothing_to_reuse(self, name: str) -> StoreError:
         what = f"the results before hold no {name!r} to take over"

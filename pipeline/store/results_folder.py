@@ -425,7 +425,7 @@ def scan_table(
     others: list[Path] = []
     for manifest in _select(manifests, partition):
         entry = manifest.tables.get(table.removeprefix(QUARANTINE))
-        if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
+        if entry is not None and f"{table}.parquet" in manifest.files:
             path = manifest.path(table)
             check_size(path, manifest.count_rows(table))
             (current if entry.contract_version == present else others).append(path)

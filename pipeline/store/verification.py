@@ -1,20 +1,17 @@
-"""Are the results still what was written? The same examination for a folder and for an object store."""
+"""Are the results still what was written?"""
 
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 from pipeline.core import TooLargeError, read_bounded, walk_files
-from pipeline.store.checksums import NOTES, decode_checked, encode_marker, parse_manifest, parse_marker
+from pipeline.store.checksums import NOTES, decode_checked, parse_manifest
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_file
 from pipeline.store.generation import LATEST
 from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
 
 RUNS = "runs"
-ABSENT = ""
-"""Stands for the hash of a file that is not there."""
 _RUN_DEPTHS = (1, 2)
 """Slashes in the folder of a run, ``runs/stem`` or ``runs/folder/stem``."""
 
@@ -28,7 +25,7 @@ class Problem:
             belongs to none.
         path: the file.
         code: ``file_missing``, ``file_damaged``, ``manifest_damaged``, ``run_missing``, ``name_clash``,
-            ``old_generation``, ``extra_file``, ``note_damaged``, ``path_unread``, ...
+            ``extra_file``, ``note_damaged``, ``path_unread``, ...
         what: what is wrong, one sentence without a full stop.
         home: folder of the run in the results; empty for a file that belongs to none.
     """
@@ -54,22 +51,6 @@ class Examination:
     problems: tuple[Problem, ...]
     unchecked: tuple[str, ...]
     files: Tally = field(default_factory=Tally)
-
-
-class Files(Protocol):
-    """The files of results, on disk or in an object store."""
-
-    def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
-        """Every name in the results; ``skip`` is told of each folder that is not read, and why."""
-
-    def read(self, name: str) -> bytes | None:
-        """The content of a file; None when there is none."""
-
-    def hash(self, name: str) -> str:
-        """SHA-256 of a file in hexadecimal; `ABSENT` when there is none."""
-
-    def locate(self, name: str) -> Path:
-        """The path to show."""
 
 
 class DiskFiles:
@@ -100,20 +81,22 @@ class DiskFiles:
             return None
 
     def hash(self, name: str) -> str:
-        """SHA-256 of a file in hexadecimal; `ABSENT` when there is none."""
+        """SHA-256 of a file in hexadecimal; empty when there is none."""
         path = self.locate(name)
         try:
-            return ABSENT if path.is_symlink() or not path.is_file() else hash_file(path)
+            return "" if path.is_symlink() or not path.is_file() else hash_file(path)
         except FileNotFoundError:
-            return ABSENT
+            return ""
 
     def locate(self, name: str) -> Path:
         """The path to show."""
         return self._root / name
 
 
-def examine_files(files: Files, *, sample: Sample | None = None) -> Examination:
-    """Read all results again, and hold them against what says what they were.
+def examine_files(files: DiskFiles, *, sample: Sample | None = None) -> Examination:
+    """Read the current results of all runs again, and hold them against their manifests.
+
+    Older generations are not looked at: nobody reads them any more.
 
     Args:
         files: the results.
@@ -123,116 +106,90 @@ def examine_files(files: Files, *, sample: Sample | None = None) -> Examination:
 
 
 class _Examiner:
-    def __init__(self, files: Files, sample: Sample | None) -> None:
+    def __init__(self, files: DiskFiles, sample: Sample | None) -> None:
         self._files = files
         self._unread: list[Problem] = []
         self._names = files.names(self._leave_out)
         self._sorted = sorted(self._names)
         self._sample, self._tally = sample, Tally()
-        # A generation's folder may hold a file of any name, and runs may stand beside it.
-        self._folders = {name.rpartition("/")[0] for name in self._names if name.endswith(f"/{MARKER}")}
 
     def examine(self) -> Examination:
         problems = list(self._unread)
         # A run has a link to its results only when it had a manifest.
-        for home in sorted(self._find_folders(MANIFEST) | self._find_folders(LATEST)):
+        for home in sorted(self._find_homes(MANIFEST) | self._find_homes(LATEST)):
             problems += [replace(problem, home=home) for problem in self._examine_run(home)]
         problems += self._examine_notes()
         of_all = {name for name in self._names if is_file_name(name) and "/" not in name}
         return Examination(problems=tuple(problems), unchecked=tuple(sorted(of_all)), files=self._tally)
 
-    def _find_folders(self, name: str) -> set[str]:
+    def _leave_out(self, path: Path, why: str) -> None:
+        self._unread.append(Problem(run="", path=path, code="left_out", what=why))
+
+    def _find_homes(self, name: str) -> set[str]:
         """Folders of runs that hold a name."""
         folders = {path.removesuffix(f"/{name}") for path in self._names if path.endswith(f"/{name}")}
-        depths = {home: home.count("/") for home in folders if home.startswith(f"{RUNS}/")}
-        return {home for home, depth in depths.items() if depth in _RUN_DEPTHS} - self._folders
-
-    def _leave_out(self, locate: Path, why: str) -> None:
-        self._unread.append(Problem(run="", path=locate, code="left_out", what=why))
+        # A generation's folder may hold a file of any name, and runs may stand beside it.
+        return {
+            home
+            for home in folders
+            if home.startswith(f"{RUNS}/")
+            and home.count("/") in _RUN_DEPTHS
+            and f"{home}/{MARKER}" not in self._names
+        }
 
     def _examine_run(self, home: str) -> list[Problem]:
         """Problems of a run; looked at again when somebody has written it meanwhile."""
-        name = f"{home}/{MANIFEST}"
+        name, run = f"{home}/{MANIFEST}", home.removeprefix(f"{RUNS}/")
         while True:
             try:
                 data = self._files.read(name)
-                problems = self._judge_run(name, data)
+                problems = [*self._judge_run(run, home, data)]
                 if not problems or self._files.read(name) == data:
                     return problems
             except OSError as error:
                 code = "manifest_damaged" if isinstance(error, TooLargeError) else "disk_error"
-                return [self._problem(_folder_of(name), name, code, _format_os_error(error))]
+                return [self._problem(run, name, code, _format_os_error(error))]
 
-    def _judge_run(self, name: str, data: bytes | None) -> list[Problem]:
-        run = _folder_of(name)
+    def _judge_run(self, run: str, home: str, data: bytes | None) -> Iterator[Problem]:
+        name = f"{home}/{MANIFEST}"
         if data is None:
-            return [self._problem(run, name, "run_missing", "the manifest of the run is gone")]
-        home = self._files.locate(name).parent
+            yield self._problem(run, name, "run_missing", "the manifest of the run is gone")
+            return
+        path = self._files.locate(home)
         try:
-            manifest = parse_manifest(data, home)
+            manifest = parse_manifest(data, path)
         except StoreError as error:
-            return [Problem(run=run, path=home, code=error.code, what=str(error))]
-        try:
-            check_home(manifest.run, home, top=self._files.locate(RUNS))
-        except StoreError as error:
-            return [Problem(run=run, path=home / MANIFEST, code=error.code, what=error.what)]
-        return [*self._judge_files(manifest, run)]
-
-    def _judge_files(self, manifest: Manifest, locate: str) -> Iterator[Problem]:
-        folder = f"{RUNS}/{locate}/{manifest.folder.name}"
-        marker = self._files.read(f"{folder}/{MARKER}")
-        if marker is None:
-            yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_missing", "the file is gone")
-        elif marker != encode_marker(manifest.run, manifest.hashes()):
-            what = "the file has changed since it was written"
-            yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_damaged", what)
-        yield from self._compare(manifest.run, folder, manifest.hashes())
-        for earlier in manifest.earlier:
-            yield from self._judge_earlier(manifest, f"{RUNS}/{locate}/{earlier}")
-
-    def _judge_earlier(self, manifest: Manifest, folder: str) -> Iterator[Problem]:
-        """Problems of a generation that is not current, all of one kind: nothing is made of it any more."""
-        marker = self._files.read(f"{folder}/{MARKER}")
-        if marker is None:
-            gone, what = folder, "the old generation is gone"
-            if any(self._list_inside(folder)):
-                gone, what = f"{folder}/{MARKER}", "in an old generation: the file is gone"
-            yield self._problem(manifest.run, gone, "old_generation", what)
+            yield self._problem(run, home, error.code, str(error))
             return
         try:
-            problems = [*self._compare(manifest.run, folder, parse_marker(marker))]
-        except ValueError as error:
-            what = f"in an old generation: the file is damaged: {error}"
-            yield self._problem(manifest.run, f"{folder}/{MARKER}", "old_generation", what)
+            check_home(manifest.run, path, top=self._files.locate(RUNS))
+        except StoreError as error:
+            yield self._problem(run, name, error.code, error.what)
             return
-        for problem in problems:
-            what = f"in an old generation: {problem.what}"
-            yield Problem(run=manifest.run, path=problem.path, code="old_generation", what=what)
+        yield from self._compare(manifest, f"{home}/{manifest.folder.name}")
 
-    def _compare(self, run: str, folder: str, expected: Mapping[str, str]) -> Iterator[Problem]:
-        for path in self._list_inside(folder):
-            if path[len(folder) + 1 :] not in expected and path != f"{folder}/{MARKER}":
-                yield self._problem(run, path, "extra_file", "the file was not written with the others")
-        for name, sha256 in expected.items():
-            path = f"{folder}/{name}"
+    def _compare(self, manifest: Manifest, folder: str) -> Iterator[Problem]:
+        """Files of the current generation that are gone, changed, or more than were written."""
+        expected = {f"{folder}/{name}": sha256 for name, sha256 in manifest.hashes().items()}
+        start = bisect_left(self._sorted, f"{folder}/")
+        inside = self._sorted[start : bisect_left(self._sorted, f"{folder}0", start)]
+        for path in inside:
+            if path not in expected and path != f"{folder}/{MARKER}":
+                what = "the file was not written with the others"
+                yield self._problem(manifest.run, path, "extra_file", what)
+        for path, sha256 in expected.items():
             if not self._tally.draws(self._sample, path) and path in self._names:
                 continue
             try:
                 digest = self._files.hash(path)
             except OSError as error:
-                yield self._problem(run, path, "disk_error", _format_os_error(error))
+                yield self._problem(manifest.run, path, "disk_error", _format_os_error(error))
                 continue
-            if digest == ABSENT:
-                yield self._problem(run, path, "file_missing", "the file is gone")
+            if not digest:
+                yield self._problem(manifest.run, path, "file_missing", "the file is gone")
             elif digest != sha256:
-                yield self._problem(run, path, "file_damaged", "the file has changed since it was written")
-
-    def _list_inside(self, folder: str) -> Iterator[str]:
-        """Names below a folder."""
-        for at in range(bisect_left(self._sorted, f"{folder}/"), len(self._sorted)):
-            if not self._sorted[at].startswith(f"{folder}/"):
-                return
-            yield self._sorted[at]
+                what = "the file has changed since it was written"
+                yield self._problem(manifest.run, path, "file_damaged", what)
 
     def _examine_notes(self) -> Iterator[Problem]:
         for name in sorted(name for name in self._names if name.startswith(NOTES) and name.endswith(".json")):
@@ -249,11 +206,6 @@ class _Examiner:
 
     def _problem(self, run: str, name: str, code: str, what: str) -> Problem:
         return Problem(run=run, path=self._files.locate(name), code=code, what=what)
-
-
-def _folder_of(name: str) -> str:
-    """Folder of a run below the folder of all runs, by the name of its manifest."""
-    return name.removeprefix(f"{RUNS}/").removesuffix(f"/{MANIFEST}")
 
 
 def _format_os_error(error: OSError) -> str:

@@ -1,6 +1,7 @@
 """Analyses of uploaded logs, diagnoses and plans, in the background in a separate process."""
 
 import hashlib
+import multiprocessing
 import secrets
 import shutil
 import tempfile
@@ -15,16 +16,15 @@ from pathlib import Path
 
 from pipeline.analysis import STAGE_WORDS, STAGES, Options
 from pipeline.analysis.analyze import analyze_log, update_datasets
-from pipeline.batch.batch_work import Entry, Report, Settings, Task
-from pipeline.batch.executors import LocalExecutor
+from pipeline.batch import executors
+from pipeline.batch.batch_work import Entry, Report, Task
 from pipeline.core import SlipError
 from pipeline.store import LogSighting, Manifest, Store, name_run, see_log
 from pipeline.web import Limits, ServerFolders, WorkbenchError
 from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, write_diagnosis, write_run_plan
 
-# Analyses and diagnoses run in a separate process, so that a crash or a hang affects nothing else.
-#
-# The process is a worker of a batch, with its limits of time and memory; a lost one is replaced.
+# Analyses and diagnoses run as the logs of a batch do, each in a process with limits of time and memory: a
+# crash or a hang affects nothing else.
 
 ASKED = "vehicle"
 """Part of the codes of errors that the choice of a vehicle resolves."""
@@ -33,6 +33,7 @@ PLAN = "plan"
 ANALYZE = "analyze"
 
 _LOOK_S = 0.2
+_END_S = 5.0
 _HINTS = {
     "timed_out": "Give `slip serve` a longer --timeout, or run it in a terminal.",
     "out_of_memory": "Give `slip serve` more --memory, or look at the log with `slip inspect`.",
@@ -54,7 +55,7 @@ class Errand(Task):
 
 
 class Workers:
-    """The worker process, for one task at a time.
+    """A process for each task, one at a time.
 
     Args:
         limits: limits of time and memory of a task.
@@ -62,8 +63,8 @@ class Workers:
     """
 
     def __init__(self, limits: Limits, work: Callable[[Task], Report] | None = None) -> None:
-        self._settings = Settings(1, limits.timeout_s, limits.memory_bytes, work or work_on_errand)
-        self._executor: LocalExecutor | None = None
+        self._limits = executors.Limits(limits.timeout_s, limits.memory_bytes)
+        self._work = work or work_on_errand
         self._one_at_a_time = threading.Lock()
         self._closed = threading.Event()
 
@@ -81,15 +82,15 @@ class Workers:
         with self._one_at_a_time:
             if self._closed.is_set():
                 raise WorkbenchError("closing", "the server is ending", hint="Start it again.")
-            self._executor = self._executor or LocalExecutor(self._settings)
-            future = self._executor.submit(errand)
+            future = executors.open_executor("local", self._work, self._limits, 1).submit(errand)
             stage = ""
             while not future.done():
-                if self._closed.is_set():
-                    raise WorkbenchError("closing", "the server is ending", hint="Start it again.")
-                if cancelled.is_set():
-                    self._executor.close()
-                    self._executor = None
+                if self._closed.is_set() or cancelled.is_set():
+                    future.cancel()
+                    for process in multiprocessing.active_children():
+                        process.join(_END_S)
+                    if self._closed.is_set():
+                        raise WorkbenchError("closing", "the server is ending", hint="Start it again.")
                     raise WorkbenchError("cancelled", "it was cancelled", hint="Start it again.")
                 wait([future], timeout=_LOOK_S)
                 noted = _read_notes(errand)
@@ -98,9 +99,8 @@ class Workers:
                     notify(stage)
             error = future.exception()
             if error is not None:
-                blame = self._executor.blame(errand, error)
-                hint = _HINTS.get(blame.code, "Try it in a terminal.")
-                raise WorkbenchError(blame.code, blame.reason, hint=hint)
+                code, reason = executors.find_blame(errand, error)
+                raise WorkbenchError(code, reason, hint=_HINTS.get(code, "Try it in a terminal."))
             entry = future.result().entry
         if entry.state == "failed":
             raise WorkbenchError(entry.code, entry.reason, hint=entry.hint)
@@ -109,10 +109,9 @@ class Workers:
     def close(self) -> None:
         """End the process, even if it is busy."""
         self._closed.set()
+        # The task that is running sees it, and ends its process.
         with self._one_at_a_time:
-            if self._executor is not None:
-                self._executor.close()
-                self._executor = None
+            pass
 
 
 def _read_notes(errand: Errand) -> str:

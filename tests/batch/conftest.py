@@ -1,5 +1,7 @@
 import shutil
+from collections.abc import Iterator
 from importlib.util import find_spec
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,14 @@ from pipeline.simulate import simulate_case
 if find_spec("s3fs") and find_spec("moto"):
     # Tests that need an object store are left out where there is no library for it.
     from object_store import bucket, server  # noqa: F401
+
+
+@pytest.fixture(autouse=True)
+def fresh_server() -> Iterator[None]:
+    """Worker processes have the environment of the test, and not that of the first one."""
+    yield
+    forkserver._forkserver._stop()
+
 
 NAMES = ("a", "b", "c", "d")
 

@@ -14,7 +14,7 @@ def test_deep_results_cost_one_line(season: Path, tmp_path: Path, dig: Callable[
     out = tmp_path / "out"
     batch(season / "a.mcap", out)
     dig(out / "runs")
-    code, said, told = run_slip("results", "status", out)
+    code, said, told = run_slip("results", "status", "--results", out)
     assert code == 1
     assert "done          1" in said
     assert (said + told).count("levels of folders deep") == 1

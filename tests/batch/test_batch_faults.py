@@ -17,7 +17,7 @@ from collections.abc import Mapping
 
 from faults import DISK, MEMORY, Fault, arm, draw_faults
 
-FEW_ROUNDS, MANY_ROUNDS = 6, 500
+ROUNDS = 500
 FINISHED, FAILED = 0, 3
 PATIENCE_S = 120.0
 MOST = {MEMORY: 160_000, DISK: 180}
@@ -59,15 +59,16 @@ def assert_whole(out: Path, undisturbed: Mapping[str, bytes], fault: Fault) -> N
             assert manifest.path(name).read_bytes() == expected, fault
 
 
-@pytest.mark.parametrize("rounds", [FEW_ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.long)])
-def test_memory_and_disk_fail(field: Path, tmp_path: Path, rounds: int) -> None:
+# Beside the test of the store that meets the same faults.
+@pytest.mark.long
+def test_memory_and_disk_fail(field: Path, tmp_path: Path) -> None:
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(["test_batch_faults", "pipeline.analysis.analyze", "pipeline.report.page"])
     out = tmp_path / "out"
     batch(field, tmp_path / "undisturbed")
     undisturbed = read_tables(tmp_path / "undisturbed")
     outcomes = []
-    for fault in draw_faults(rounds, most=MOST, seed=rounds):
+    for fault in draw_faults(ROUNDS, most=MOST, seed=ROUNDS):
         process = server.Process(target=batch_under, args=(fault, field, out), daemon=True)
         process.start()
         process.join(PATIENCE_S)
@@ -75,7 +76,7 @@ def test_memory_and_disk_fail(field: Path, tmp_path: Path, rounds: int) -> None:
         process.join()
         assert_whole(out, undisturbed, fault)
         outcomes.append(process.exitcode)
-    assert outcomes.count(FINISHED) < rounds, "faults were met"
+    assert outcomes.count(FINISHED) < ROUNDS, "faults were met"
     assert FAILED in outcomes
     last = batch(field, out)
     assert not last.problems

@@ -19,7 +19,7 @@ from batch_works import work_dying_at_steps
 
 from pipeline.store import STEPS, Store
 
-FEW_ROUNDS, MANY_ROUNDS = 6, 100
+ROUNDS = 100
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def assert_whole(out: Path, undisturbed: dict[str, bytes]) -> None:
     store = Store(out)
     assert store.examine().problems == ()
     for manifest in store.manifests():
-        for name in manifest.names():
+        for name in manifest.files:
             path = manifest.path(name)
             assert path.read_bytes() == undisturbed[str(path.relative_to(out))]
     assert store.scan("slip").select(pl.len()).collect().item() >= 0
@@ -84,10 +84,9 @@ def assert_finished(field: Path, out: Path, undisturbed: dict[str, bytes]) -> No
     assert all(path.is_symlink() for path in out.glob("runs/*/*/.tmp-*"))
 
 
-@pytest.mark.parametrize("rounds", [FEW_ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.long)])
-def test_killed_at_random_moments(
-    field: Path, tmp_path: Path, undisturbed: dict[str, bytes], rounds: int
-) -> None:
+# Beside the test of the store that kills at random moments.
+@pytest.mark.long
+def test_killed_at_random_moments(field: Path, tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
     # A server that has loaded everything forks the batches: no round is spent on starting a program.
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(
@@ -112,8 +111,8 @@ def test_killed_at_random_moments(
 
         return kill
 
-    seen = kill_at_random(field, out, undisturbed, start, rounds=rounds, longest_s=longest_s)
-    assert len(seen) > (2 if rounds == MANY_ROUNDS else 1), "batches were killed while they published"
+    seen = kill_at_random(field, out, undisturbed, start, rounds=ROUNDS, longest_s=longest_s)
+    assert len(seen) > 2, "batches were killed while they published"
     assert_finished(field, out, undisturbed)
 
 

@@ -5,25 +5,25 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.batch.batch_plan import KnownRun, assign_names, list_doubtful
+from pipeline.batch.batch_plan import KnownRun, name_runs
 
 PATHS = [Path(f"/{top}/{folder}/{stem}.mcap") for top in "xyz" for folder in "ab" for stem in "12"]
 contents = st.dictionaries(st.sampled_from(PATHS), st.integers(0, 5), min_size=1)
 
 
-def name_all(logs: dict[Path, int], known: list[KnownRun]) -> tuple[dict[Path, str], dict[Path, str]]:
+def hash_of(content: int) -> str:
+    return f"{content:064x}"[::-1]
+
+
+def name_all(
+    logs: dict[Path, int], known: list[KnownRun], *, is_present: bool = True
+) -> tuple[dict[Path, str], dict[Path, str]]:
     sizes = {path: content % 3 for path, content in logs.items()}
-    doubtful = list_doubtful(sizes, known)
-    hashes = {path: f"{logs[path]:064x}"[::-1] for path in doubtful}
-    names = assign_names(list(logs), hashes, known)
-    return dict(names.runs), dict(names.copies)
+    return name_runs(sizes, known, lambda path: hash_of(logs[path]), lambda _run: is_present)
 
 
 def know(runs: dict[Path, str], logs: dict[Path, int]) -> list[KnownRun]:
-    return [
-        KnownRun(run=run, sha256=f"{logs[path]:064x}"[::-1], size=logs[path] % 3, is_present=True)
-        for path, run in runs.items()
-    ]
+    return [KnownRun(run, hash_of(logs[path]), logs[path] % 3) for path, run in runs.items()]
 
 
 @given(contents)
@@ -54,7 +54,16 @@ def test_names_are_plain_where_they_can_be() -> None:
 
 
 def test_a_log_that_was_moved_keeps_its_run() -> None:
-    old = KnownRun(run="old/name", sha256="0" * 64, size=0, is_present=False)
-    runs, copies = name_all({Path("/x/a/1.mcap"): 0}, [old])
-    assert runs == {Path("/x/a/1.mcap"): "old/name"}
-    assert copies == {}
+    old = KnownRun("old/name", hash_of(0), 0)
+    first, second = Path("/x/a/1.mcap"), Path("/y/a/1.mcap")
+    assert name_all({first: 0, second: 0}, [old], is_present=False) == (
+        {first: "old/name"},
+        {second: "old/name"},
+    )
+    assert name_all({first: 0}, [old]) == ({}, {first: "old/name"})
+
+
+def test_a_log_that_cannot_be_read_is_no_copy() -> None:
+    first, second = Path("/x/a/1.mcap"), Path("/x/b/1.mcap")
+    runs, copies = name_runs({first: 0, second: 0}, [], lambda _path: "", lambda _run: True)
+    assert (runs, copies) == ({first: "a/1", second: "b/1"}, {})

@@ -1,11 +1,11 @@
-"""Logs and results on an object store: a local S3 server stands in for it."""
+"""Logs on an object store: a local S3 server stands in for it."""
 
 import os
 import pickle
 from pathlib import Path
 
 import pytest
-from batch_tools import batch, counts, read_tables
+from batch_tools import batch, counts
 from verbs import run_slip
 
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
@@ -15,14 +15,11 @@ import fsspec
 import numpy as np
 from object_store import BUCKET, upload
 
-from pipeline.batch import Pruning
 from pipeline.batch.batch_check import verify_results
 from pipeline.batch.recordings import find_recordings
 from pipeline.logs import LogError, RemotePath, Wanted, hash_log, open_log, read_topics, to_location
 from pipeline.logs.writer import LogWriter
-from pipeline.store import Partition, Store, StoreError
-from pipeline.store import mirror as mirror_room
-from pipeline.store.mirror import Mirror
+from pipeline.store import Store
 
 
 def test_a_log_is_read_as_if_it_were_here(bucket: fsspec.AbstractFileSystem, season: Path) -> None:
@@ -78,7 +75,6 @@ def test_a_season_in_a_bucket(bucket: fsspec.AbstractFileSystem, season: Path, t
     out = tmp_path / "out"
     first = batch(f"{BUCKET}/2026", out, executor="local")
     assert counts(first)["done"] == 3
-    assert all(line.fetched_bytes > 0 for line in first.lines)
     runs = Store(out).scan("runs").select("run", "terrain", "log").collect()
     assert runs.rows() == [
         ("2026/split", "field", f"{BUCKET}/2026/split"),
@@ -118,118 +114,8 @@ def test_addresses_survive_what_happens_to_paths() -> None:
     assert not isinstance(to_location("/data/x"), RemotePath)
 
 
-def list_published(store: fsspec.AbstractFileSystem, out: str) -> dict[str, bytes]:
-    """Every table and text that people read, by its path in the results."""
-    store.invalidate_cache()
-    start = len(out.removeprefix("s3://")) + 1
-    names = [
-        name for name in store.find(out) if not name[start:].startswith("batch/") and "/." not in name[start:]
-    ]
-    return {name[start:]: store.cat_file(name) for name in names}
-
-
-def test_results_in_a_bucket_are_those_of_a_folder(
-    bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path
-) -> None:
-    out = f"{BUCKET}/results"
-    batch(season, tmp_path / "here")
-    first = batch(season, tmp_path / "mirror", address=out, executor="local")
-    assert counts(first) == {"done": 4}
-    assert first.problems == ()
-    published = list_published(bucket, out)
-    assert published == read_tables(tmp_path / "here")
-
-    # Another machine knows nothing but the bucket.
-    assert counts(batch(season, tmp_path / "elsewhere", address=out)) == {"unchanged": 4}
-    assert not list((tmp_path / "elsewhere").rglob("slip.parquet"))
-    mirror = Mirror(out, tmp_path / "elsewhere")
-    mirror.pull_index()
-    ice = Partition(terrain="ice")
-    mirror.pull_tables(["slip"], ice.select(mirror.store.manifests()))
-    assert mirror.store.query("SELECT DISTINCT run FROM slip", ice)["run"].to_list() == ["season/d"]
-    assert len(list((tmp_path / "elsewhere").rglob("slip.parquet"))) == 1
-    assert verify_results(mirror.store, mirror=mirror, logs=False, notify=print).is_clean
-
-    # A stage that changed reuses what another machine computed.
-    (season / "a.toml").write_text("[slip]\nlength_scale_m = 2.0\n")
-    again = batch(season, tmp_path / "elsewhere", address=out, pruning=Pruning(keep=0))
-    assert counts(again) == {"done": 1, "unchanged": 3}
-    assert again.removed == 1
-    batch(season, tmp_path / "here", pruning=Pruning(keep=0))
-    assert list_published(bucket, out) == read_tables(tmp_path / "here")
-
-    damaged = next(name for name in bucket.find(out) if name.endswith("velocities.parquet"))
-    bucket.pipe_file(damaged, b"x")
-    gone = next(name for name in bucket.find(out) if name.endswith("season/d/manifest.json"))
-    bucket.rm(gone)
-    mirror.pull_index()
-    found = verify_results(mirror.store, mirror=mirror, logs=False, notify=print, repair=True)
-    assert [problem.code for problem in found.files] == ["file_damaged"]
-    assert {repair.action for repair in found.repairs} == {"queued"}
-    mended = batch(season, tmp_path / "elsewhere", address=out)
-    assert counts(mended) == {"done": 2, "unchanged": 2}
-    mirror.pull_index()
-    found = verify_results(mirror.store, mirror=mirror, logs=False, notify=print)
-    assert found.files == ()
-
-
-class FailingStore:
-    """Takes so many objects and then no more."""
-
-    def __init__(self, objects: object, allowed: int) -> None:
-        self.objects = objects
-        self.left = allowed
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.objects, name)
-
-    def put(self, paths: list[str], addresses: list[str]) -> None:
-        for path, address in zip(paths, addresses, strict=True):
-            self.put_file(path, address)
-
-    def put_file(self, path: str, address: str) -> None:
-        self.pipe_file(address, Path(path).read_bytes())
-
-    def pipe_file(self, address: str, value: bytes) -> None:
-        self.left -= 1
-        if self.left < 0:
-            raise OSError("the network is gone")
-        self.objects.pipe_file(address, value)  # type: ignore[attr-defined]
-
-
-def test_a_run_is_published_whole_or_not_at_all(
-    bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = f"{BUCKET}/results"
-    log = season / "a.mcap"
-    opened = mirror_room._open_objects
-    for allowed in (0, 1, 5):
-        with monkeypatch.context() as patch:
-            patch.setattr(mirror_room, "_open_objects", lambda url, n=allowed: FailingStore(opened(url), n))
-            outcome = batch(log, tmp_path / f"mirror{allowed}", address=out)
-        assert outcome.has_failed
-        assert outcome.lines[0].code in {"store_unreachable", ""}
-        mirror = Mirror(out, tmp_path / "reader")
-        mirror.pull_index()
-        assert mirror.examine().problems == ()
-    assert not batch(log, tmp_path / "last", address=out).has_failed
-    batch(log, tmp_path / "here")
-    assert list_published(bucket, out) == read_tables(tmp_path / "here")
-
-
-def test_a_bucket_that_is_not_there_is_said(
-    bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path
-) -> None:
-    del bucket
-    with pytest.raises(StoreError) as caught:
-        Mirror("nothing://x/y", tmp_path)
-    assert caught.value.code == "no_object_store"
-    outcome = batch(season / "a.mcap", tmp_path / "mirror", address="s3://nowhere/results")
-    assert outcome.lines[0].code == "store_unreachable"
-
-
 def test_a_store_without_credentials_or_out_of_reach_is_said_in_one_line(
-    bucket: fsspec.AbstractFileSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bucket: fsspec.AbstractFileSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value, why in (
         ("AWS_ENDPOINT_URL", "http://127.0.0.1:9", "Could not connect"),
@@ -238,54 +124,28 @@ def test_a_store_without_credentials_or_out_of_reach_is_said_in_one_line(
         monkeypatch.setenv(name, value)
         monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
         type(bucket).clear_instance_cache()
-        with pytest.raises(StoreError, match=why) as caught:
-            Mirror(f"{BUCKET}/results", tmp_path).pull_index()
-        assert caught.value.code == "store_unreachable"
+        with pytest.raises(LogError, match=why) as caught:
+            open_log(f"{BUCKET}/logs/a.mcap")
+        assert caught.value.code == "log_unreadable"
         assert len(str(caught.value).splitlines()) == 1
         assert "AWS_ACCESS_KEY_ID" in caught.value.hint
 
 
-def test_what_has_not_changed_is_not_fetched_again(bucket: fsspec.AbstractFileSystem, tmp_path: Path) -> None:
-    upload(bucket, {"results/index.html": b"old", "results/map.html": b"old"})
-    mirror = Mirror(f"{BUCKET}/results", tmp_path)
-    mirror.pull_index()
-    before = {path.name: path.stat().st_ino for path in tmp_path.iterdir()}
-    upload(bucket, {"results/map.html": b"new"})
-    mirror.pull_index()
-    after = {path.name: path.stat().st_ino for path in tmp_path.iterdir()}
-    assert {name for name in before if before[name] == after[name]} == {"index.html"}
-    assert (tmp_path / "map.html").read_bytes() == b"new"
-
-
-def test_a_bucket_of_a_stranger_writes_nothing_outside_of_its_mirror(
-    bucket: fsspec.AbstractFileSystem,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("analyze", "a.mcap", "--results"),
+        ("batch", "logs", "--results"),
+        ("results", "status", "--results"),
+        ("results", "query", "SELECT 1", "--results"),
+    ],
+)
+def test_results_are_kept_in_a_folder_and_copied_by_the_tool_of_the_store(
+    verb: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    home = tmp_path / "home"
-    home.mkdir()
-    (home / ".bashrc").write_text("precious")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(home / ".cache"))
-    monkeypatch.setenv("HOME", str(home))
-    # Of the mirror in ~/.cache/slip/results/<hash> everything above is within reach.
-    upload(
-        bucket,
-        {
-            "results/batch/logs/../../../../../../.bashrc": b"evil",
-            "results/runs/../../../../../.config/manifest.json": b"evil",
-        },
-    )
-    out = f"{BUCKET}/results"
-    for arguments in (
-        ("results", "status", out),
-        ("results", "verify", out),
-        ("results", "query", "SELECT 1", "--results", out),
-    ):
-        code, _, told = run_slip(*arguments)
-        assert code == 1
-        said = told.splitlines()
-        assert len(said) == 1
-        assert out in said[0]
-    found = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
-    assert found == {".bashrc"}
-    assert (home / ".bashrc").read_text() == "precious"
+    monkeypatch.chdir(tmp_path)
+    code, _, said = run_slip(*verb, f"{BUCKET}/results")
+    assert code == 1
+    assert "results are in a folder of this machine" in said
+    assert "aws s3 sync" in said
+    assert list(tmp_path.iterdir()) == []

@@ -136,8 +136,8 @@ def test_a_name_that_is_no_text_passes_through_everything(odd: Path, tmp_path: P
         ["results", "status"],
         ["results", "status", "--json"],
         ["results", "query", "SELECT * FROM runs"],
-        ["results", "explain", run],
-        ["results", "explain", str(odd)],
+        ["results", "status", run],
+        ["results", "status", str(odd)],
         ["batch", str(odd)],
     ):
         code, said, told = run_slip(*arguments, "--results", out)

@@ -22,9 +22,6 @@ VERBS = {
     "batch": ("batch", "s3://nobody/logs"),
     "batch of one": ("batch", LOG),
     "batch of a glob": ("batch", "s3://nobody/logs/*.mcap"),
-    "status": ("results", "status", "s3://nobody/results"),
-    "query": ("results", "query", "SELECT * FROM runs", "--results", "s3://nobody/results"),
-    "verify": ("results", "verify", "s3://nobody/results"),
 }
 
 
@@ -57,7 +54,7 @@ def test_without_credentials(verb: str) -> None:
     assert "Unable to locate credentials" in run(*VERBS[verb])
 
 
-@pytest.mark.parametrize("verb", ["batch", "inspect", "query"])
+@pytest.mark.parametrize("verb", ["batch", "inspect"])
 def test_without_anybody_at_the_address(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as place:
         place.bind(("127.0.0.1", 0))
@@ -69,8 +66,7 @@ def test_without_anybody_at_the_address(verb: str, monkeypatch: pytest.MonkeyPat
     assert f"127.0.0.1:{port}" in run(*VERBS[verb])
 
 
-@pytest.mark.parametrize("verb", ["batch", "query"])
-def test_a_store_that_is_silent_does_not_hold_anybody(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_that_is_silent_does_not_hold_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bucket_room, "_ANSWER_S", 0.2)
     monkeypatch.setattr(bucket_room, "_ATTEMPTS", 1)
     with socket.create_server(("127.0.0.1", 0)) as place:
@@ -78,6 +74,6 @@ def test_a_store_that_is_silent_does_not_hold_anybody(verb: str, monkeypatch: py
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", "a")
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "b")
         started = time.monotonic()
-        said = run(*VERBS[verb])
+        said = run(*VERBS["batch"])
     assert time.monotonic() - started < 10.0
     assert "imeout" in said

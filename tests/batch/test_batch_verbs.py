@@ -1,6 +1,5 @@
 """The verbs as scripts use them: JSON, exit codes, one clear line."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -29,25 +28,3 @@ def test_estimates_do_without_sizes() -> None:
     assert 0.0 <= watch.estimate_rest() < 10.0
     watch.notify(Line(path="large", state="done"), 1000)
     assert watch.estimate_rest() == 0.0
-
-
-def test_schedule_prints_units_of_this_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    code, out, _ = run_slip(
-        "batch",
-        "schedule",
-        "logs",
-        "--results",
-        "results",
-        "--jobs",
-        "4",
-        "--print",
-        "systemd",
-        "--at",
-        "01:30",
-    )
-    assert code == 0
-    assert "--trend" not in run_slip("batch", "schedule", "logs", "--no-trend")[1]
-    assert f"WorkingDirectory={tmp_path}" in out
-    assert f"{sys.executable} -P -m pipeline batch run --trend logs --results results --jobs 4\n" in out
-    assert "OnCalendar=*-*-* 01:30:00" in out

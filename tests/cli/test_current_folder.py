@@ -2,7 +2,6 @@
 
 import json
 import os
-import shlex
 import shutil
 import subprocess
 import sys
@@ -87,10 +86,6 @@ def test_no_verb_imports_from_the_current_folder(trap: Path) -> None:
     run_in(trap, [SLIP, "analyze", "run.mcap", "--results", "results", "--no-diagnosis"])
     assert list((trap / "cache").rglob("vega-*.js"))
     run_in(trap, [SLIP, "batch", "run.mcap", "--results", "many", "--jobs", "2", "--settle", "0"])
-    unit = run_in(trap, [SLIP, "batch", "schedule", "--settle", "0", "run.mcap", "--results", "nightly"])
-    (line,) = [line for line in unit.splitlines() if line.startswith("ExecStart=")]
-    run_in(trap, shlex.split(line.removeprefix("ExecStart=")), codes=(0, 3))
-    assert (trap / "nightly").exists()
 
 
 @pytest.mark.long

@@ -1,7 +1,6 @@
 """The commands by task, and an option means the same everywhere."""
 
 import inspect
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from cyclopts import App
 from verbs import run_program, run_verb
 
 from pipeline.cli import build_app
-from pipeline.simulate import simulate_case
 
 
 def list_apps(app: App, words: str = "") -> Iterator[tuple[str, App]]:
@@ -32,7 +30,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
     options = {words: list_options(app) for words, app in list_apps(build_app())}
     without = {words for words, names in options.items() if names and "--results" not in names}
     assert without == {
-        "batch schedule", "effects", "fleet map merge", "model new", "model new-effect",
+        "effects", "fleet map merge", "model new", "model new-effect",
         "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
     }  # fmt: skip
 
@@ -44,17 +42,8 @@ def test_no_option_has_a_negative_that_means_nothing() -> None:
         for name in list_options(app)
         if name.startswith(("--no-", "--empty-"))
     }
-    assert denied == {"--no-diagnosis", "--no-report", "--no-logs", "--no-trend"}
+    assert denied == {"--no-diagnosis", "--no-report", "--no-logs"}
     assert run_verb("effects", "--no-json").returncode == 2
-
-
-def test_a_batch_has_its_verb_and_does_without(tmp_path: Path) -> None:
-    simulate_case("husky_tile", out=tmp_path / "logs" / "a.mcap", duration_s=20.0)
-    first = run_verb("batch", "logs", "--settle", 0, "--json", cwd=tmp_path)
-    again = run_verb("batch", "run", "logs", "--settle", 0, "--json", cwd=tmp_path)
-    assert (first.returncode, again.returncode) == (0, 0)
-    assert json.loads(first.stdout)["done"] == json.loads(again.stdout)["unchanged"] == 1
-    assert "batch run --trend logs" in run_verb("batch", "schedule", "logs", cwd=tmp_path).stdout
 
 
 def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 from verbs import run_program, run_slip
 
 from pipeline.cli import verbs_results
-from pipeline.core import slip_command
+from pipeline.core import python_command
 from pipeline.store import Store
 from pipeline.store.parquet_tables import schema_of
 
@@ -158,8 +158,16 @@ def test_an_answer_is_printed_in_parts(out: Path) -> None:
 
 
 def test_a_reader_of_the_answer_may_leave(out: Path) -> None:
-    command = slip_command(
-        "results", "query", "SELECT a.run FROM windows a, windows b", "--results", str(out), "--to", "csv"
+    command = python_command(
+        "-m",
+        "pipeline",
+        "results",
+        "query",
+        "SELECT a.run FROM windows a, windows b",
+        "--results",
+        str(out),
+        "--to",
+        "csv",
     )
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -47,7 +47,7 @@ def test_a_log_cannot_write_lines_of_its_own(tmp_path: Path, capsys: pytest.Capt
     with pytest.raises(SystemExit):
         main(["batch", str(log), "--results", str(out), "--executor", "inline", "--settle", "0"])
     with pytest.raises(SystemExit):
-        main(["results", "status", str(out)])
+        main(["results", "status", "--results", str(out)])
     with pytest.raises(SystemExit):
         main(["analyze", str(log), "--results", str(out)])
     text = "".join(capsys.readouterr())

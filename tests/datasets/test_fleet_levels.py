@@ -1,7 +1,6 @@
 """Numbers of a fleet by level: the vehicle's, the ground's, a run's own, or open."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 from comparison_store import Run, write_run
 from verbs import run_slip
 
-from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
+from pipeline.batch.batch_plan import refresh_pools
 from pipeline.datasets.compare import compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.forecast import FleetNumber, fit_fleet
@@ -19,7 +18,6 @@ from pipeline.datasets.prediction import fit_results
 from pipeline.datasets.trend import follow_trend
 from pipeline.models.parameter import Level
 from pipeline.store import Store
-from pipeline.store.mirror import Mirror
 
 ERROR = 0.02
 ICE_AND_OTHERS = {"asphalt": 1.0, "gravel": 0.98, "ice": 0.7}
@@ -216,34 +214,3 @@ def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
     shown = json.loads(run_slip("fleet", "show", str(results.root), "--json")[1])
     assert "mud" in shown["parameters"][0]["terrains"]
     assert not any("have changed since" in note for note in shown["notes"])
-
-
-def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
-    results: Store,
-    tmp_path: Path,
-) -> None:
-    fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
-    objects = fsspec.filesystem("memory")
-    objects.store.clear()
-    new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
-    run_slip("fleet", "fit", str(results.root))
-    run_slip("fleet", "trend", str(results.root), "--by", "vehicle", "--limit", "wheel_radius.k=1.5")
-    write_run(results, replace(new, start_ns=new.start_ns + 10**15))
-    for path in results.root.rglob("*"):
-        if path.is_file() and "latest" not in path.parts and path.name != ".lock":
-            objects.pipe_file(
-                f"/field/results/{path.relative_to(results.root).as_posix()}", path.read_bytes()
-            )
-    mirror = Mirror("memory://field/results", tmp_path / "mirror")
-    mirror.store.write_results_text("map.html", "drawn here")
-    refresh_remote_pools(mirror)
-    published = {
-        name: objects.cat_file(f"/field/results/{name}").decode("utf-8")
-        for name in ("fleet.json", "fleet.html", "trend.json", "trend.html", "index.html", "map.html")
-    }
-    objects.store.clear()
-    assert '"new/k0"' in published["fleet.json"]
-    assert "in new, above the limit of 1.5" in published["trend.json"]
-    assert "above the limit of 1.5" in published["trend.html"]
-    linked = set(re.findall(r'href="(\w+\.html)"', published["index.html"]))
-    assert {"fleet.html", "map.html", "trend.html"} <= linked <= set(published)

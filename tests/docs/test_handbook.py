@@ -114,8 +114,6 @@ def _require_verb(text: str, verbs: Mapping[str, App]) -> None:
         assert words[1:] == ["model"] or words[1:3] == ["model", "remove"], text
         return
     known = _list_options(found)
-    if words[1:3] == ["batch", "schedule"]:
-        known |= _list_options(verbs["slip batch"])  # what it is given it passes on
     assert {word.split("=")[0] for word in words if word.startswith("--")} <= known | {"--help"}, text
 
 

@@ -279,10 +279,10 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
             folder / "results" / "runs"
         )
         verbs = [
-            ["results", "status", "results"],
+            ["results", "status", "--results", "results"],
             ["results", "verify", "results"],
             ["results", "query", rng.choice(QUERIES), "--results", "results"],
-            ["results", "explain", str(run), "--results", "results"],
+            ["results", "status", str(run), "--results", "results"],
             [
                 "export",
                 str(run),

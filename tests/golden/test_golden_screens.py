@@ -34,9 +34,7 @@ READING = {
     "results.txt": [
         ("results", "status"),
         ("results", "verify"),
-        ("results", "explain", RUN),
-        ("results", "explain", RUN, "slip.g_w"),
-        ("results", "explain", RUN, "effective_track"),
+        ("results", "status", RUN),
         ("results", "query", "SELECT run, input, subset, samples FROM aggregates ORDER BY input, subset"),
     ],
     "model.txt": [
@@ -84,7 +82,7 @@ JSON = {
     "analyze": ("analyze", "field/wide.mcap"),
     "diagnose": ("diagnose", RUN),
     "inspect": ("inspect", "field/cut.mcap"),
-    "explain": ("results", "explain", RUN, "slip.g_w"),
+    "status_of_a_run": ("results", "status", RUN),
     "status": ("results", "status"),
     "verify": ("results", "verify"),
     "model_show": ("model", "show", "husky.toml"),
@@ -217,6 +215,6 @@ def test_a_batch_says_what_became_of_each_log(place: Path, check_golden: Check) 
     cut(place)
     (place / "field" / "text.mcap").write_text("this is no recording\n" * 100)
     words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season")
-    told = transcribe([words, words, ("results", "status", "season")], place)
+    told = transcribe([words, words, ("results", "status", "--results", "season")], place)
     keys = format_shape(run_verb(*words, "--json", cwd=place).stdout)
     check_golden("screen_batch.txt", f"{told}\n\n{keys}")

@@ -1,4 +1,4 @@
-"""Results from a stranger, in a bucket or in a folder, read and write nothing outside of themselves."""
+"""Results from a stranger read and write nothing outside of themselves."""
 
 from __future__ import annotations
 
@@ -6,65 +6,21 @@ import os
 import shutil
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import polars as pl
 import pytest
-from store_samples import read_seed, write_generation
+from store_samples import write_generation
 
 from pipeline.store import Store, StoreError
 from pipeline.store.checksums import decode_checked, encode_checked
 from pipeline.store.files import hash_bytes
-from pipeline.store.mirror import Mirror
-
-fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 RUN = "2026/husky"
-ADDRESS = "memory://field/results"
-
-OUTSIDE = [
-    "batch/logs/../../../victim/bashrc",
-    "batch/logs/../../../victim/bashrc.json",
-    "runs/../../victim/manifest.json",
-    "runs/a/../../../victim/manifest.json",
-    "runs//etc/manifest.json",
-    "runs/..\\..\\victim/manifest.json",
-    "runs/\uff0e\uff0e/\uff0e\uff0e/victim/manifest.json",
-    "runs/\u2025/\u2025/victim/manifest.json",
-    f"runs/{'x' * 300}/manifest.json",
-    f"runs/{'/'.join(['x' * 200] * 30)}/manifest.json",
-    "runs/a\0b/manifest.json",
-    "runs/link/manifest.json",
-    "batch/logs/link/x.json",
-]
-"""Keys that look like objects of results and lead, or might lead, elsewhere."""
-
-OTHERS = [
-    "..",
-    ".bashrc",
-    ".lock",
-    "C:",
-    "\uff0e\uff0e",
-    "latest\\x",
-    "runs/a/b/c/d/manifest.json",
-]
-"""Keys that are no objects of results."""
-
-
-@pytest.fixture
-def bucket() -> Iterator[fsspec.AbstractFileSystem]:
-    objects = fsspec.filesystem("memory")
-    objects.store.clear()
-    yield objects
-    objects.store.clear()
 
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder with something precious in it, beside which the mirror will stand."""
+    """A folder with something precious in it, beside which the results stand."""
     victim = tmp_path / "victim"
     victim.mkdir()
     (victim / "bashrc").write_text("precious")
@@ -77,71 +33,8 @@ def look(folder: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and "mirror" not in path.relative_to(folder).parts[:1]
+        if path.is_file()
     }
-
-
-def put(objects: fsspec.AbstractFileSystem, name: str, data: bytes) -> None:
-    """An object under any key at all: nothing tidies the key up."""
-    from fsspec.implementations.memory import MemoryFile  # noqa: PLC0415 - an extra
-
-    key = f"/field/results/{name}"
-    objects.store[key] = MemoryFile(objects, key, data)
-
-
-@pytest.mark.parametrize("name", OUTSIDE, ids=lambda name: ascii(name)[:40])
-def test_an_object_whose_name_leads_elsewhere_is_refused(
-    bucket: fsspec.AbstractFileSystem, place: Path, name: str
-) -> None:
-    if "link" in name:
-        link = place / "mirror" / name.rpartition("/")[0]
-        link.parent.mkdir(parents=True)
-        link.symlink_to(place / "victim")
-    before = look(place)
-    put(bucket, name, b'{"evil": 1}')
-    with pytest.raises(StoreError) as caught:
-        Mirror(ADDRESS, place / "mirror").pull_index()
-    assert caught.value.code == "bad_object_name"
-    assert ADDRESS in caught.value.where
-    assert len(str(caught.value).splitlines()) == 1
-    assert look(place) == before
-
-
-@pytest.mark.parametrize("name", OTHERS, ids=ascii)
-def test_objects_that_are_none_of_ours_are_left_alone(
-    bucket: fsspec.AbstractFileSystem, place: Path, name: str
-) -> None:
-    before = look(place)
-    put(bucket, name, b"evil")
-    put(bucket, "index.html", b"ours")
-    Mirror(ADDRESS, place / "mirror").pull_index()
-    Mirror(ADDRESS, place / "mirror").pull_index()
-    assert look(place) == before
-    found = {path.name: path.read_bytes() for path in (place / "mirror").iterdir() if path.is_file()}
-    assert b"evil" not in found.values()
-    assert found["index.html"] == b"ours"
-
-
-def upload(objects: fsspec.AbstractFileSystem, root: Path) -> None:
-    for path in root.rglob("*"):
-        if path.is_file() and "latest" not in path.parts and path.name != ".lock":
-            put(objects, path.relative_to(root).as_posix(), path.read_bytes())
-
-
-def test_a_run_is_fetched_as_it_was_written(
-    bucket: fsspec.AbstractFileSystem, store: Store, tmp_path: Path
-) -> None:
-    manifest = write_generation(store, RUN, "k", 1)
-    upload(bucket, store.root)
-    mirror = Mirror(ADDRESS, tmp_path / "mirror")
-    mirror.pull_run(RUN)
-    assert read_seed(mirror.store, RUN) == 1
-    damaged = manifest.path("slip").relative_to(store.root).as_posix()
-    put(bucket, damaged, manifest.path("slip").read_bytes()[:-1] + b"x")
-    with pytest.raises(StoreError) as caught:
-        Mirror(ADDRESS, tmp_path / "another").pull_run(RUN)
-    assert caught.value.code == "file_damaged"
-    assert damaged in caught.value.where
 
 
 def edit(path: Path, changes: dict[str, object]) -> None:
@@ -150,7 +43,7 @@ def edit(path: Path, changes: dict[str, object]) -> None:
 
 
 ENTRY = {"bytes": 1, "sha256": "0" * 64}
-TABLE = {**ENTRY, "file": "slip.parquet", "rows": 1, "quarantined": 0, "contract_version": 1, "rules": {}}
+TABLE = {"rows": 1, "quarantined": 0, "contract_version": 1, "rules": {}}
 ELSEWHERE = [
     "../../../victim/x",
     "/etc/passwd",
@@ -175,8 +68,8 @@ def test_a_manifest_names_nothing_outside_of_its_run(store: Store, field: str) -
             "key": {"key": name},
             "earlier": {"earlier": [name]},
             "files": {"files": {name: ENTRY}},
-            "table": {"tables": {name: {**TABLE, "file": f"{name}.parquet"}}},
-            "table's file": {"tables": {"slip": {**TABLE, "file": name}}},
+            "table": {"tables": {name: TABLE}, "files": {f"{name}.parquet": ENTRY}},
+            "table's file": {"tables": {"slip": TABLE}, "files": {name: ENTRY}},
         }
         edit(path, changes[field])
         for look_at in (store.manifests, lambda: store.manifest(RUN), lambda: store.prune(0)):
@@ -250,8 +143,9 @@ def test_a_table_has_the_columns_of_its_contract(store: Store, change: str) -> N
     odd = frame.drop("t") if change == "a column less" else frame.with_columns(pl.lit("x").alias("t"))
     odd.write_parquet(path)
     home = path.parents[1] / "manifest.json"
-    entry = {**asdict(manifest.tables["slip"]), "sha256": hash_bytes(path.read_bytes())}
-    edit(home, {"tables": {"slip": entry}})
+    files = {name: asdict(entry) for name, entry in manifest.files.items()}
+    files["slip.parquet"]["sha256"] = hash_bytes(path.read_bytes())
+    edit(home, {"files": files})
     with pytest.raises(StoreError, match="not those of its contract") as caught:
         store.read(RUN, "slip")
     assert caught.value.code == "table_damaged"
