@@ -587,7 +587,7 @@ def _compare(
                 "the pose comes from the wheels, so forward slip is not observable: "
                 f"{ratings[0].source} is computed from them, and the log has no other pose"
             )
-            findings.append(Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)))
+            findings.append(Finding("pose_from_wheels", "error", text, where=str(ratings[0].source)))
     recording = examine(replace(given, sources=sources))
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
