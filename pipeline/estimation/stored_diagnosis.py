@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUTS, SlipError
+from pipeline.core import INPUTS, PathError, SlipError
 from pipeline.results import RunDiagnosis, read_model, read_result, to_json
 from pipeline.run import MotionError, load_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
@@ -23,6 +23,7 @@ from pipeline.store import (
     Generation,
     Manifest,
     Store,
+    StoreError,
     hash_json,
     locate_beside,
     make_folder,
@@ -262,13 +263,13 @@ def find_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
 
 
 def _read_stored(results: Path, run: str, key: str) -> RunDiagnosis | None:
-    """What `keep_diagnosis` stored of a run under a key."""
-    path = locate_beside(results, "diagnoses", run, ".json")
-    if not path.is_file():
+    """What `keep_diagnosis` stored of a run under a key; None without it, or if it is to be made again."""
+    try:
+        path = locate_beside(results, "diagnoses", run, ".json")
+        stored = read_stored(path, _StoredDiagnosis)
+        return read_result(stored.diagnosis, RunDiagnosis, path) if stored.key == key else None
+    except (StoreError, PathError):
         return None
-    hint = "Remove it: it is made again"
-    stored = read_stored(path, _StoredDiagnosis, hint=hint)
-    return read_result(stored.diagnosis, RunDiagnosis, path) if stored.key == key else None
 
 
 def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: RunDiagnosis) -> None:
