@@ -250,7 +250,7 @@ def _name_items(
     runs = {path: run for run, path in paths.items()}
     runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
     new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
-    places = {item.log.path: item.path for item in items}
+    locations = {item.log.path: item.path for item in items}
     known = [
         KnownRun(run, str(log.get("sha256")), size)
         for run, log in logs.items()
@@ -269,8 +269,8 @@ def _name_items(
         return content
 
     def is_present(run: str) -> bool:
-        place = places.get(paths[run])
-        return place is not None and find_hash(place) == logs[run].get("sha256")
+        location = locations.get(paths[run])
+        return location is not None and find_hash(location) == logs[run].get("sha256")
 
     named, copies = name_runs(new, known, find_hash, is_present)
     return [

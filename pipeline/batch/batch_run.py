@@ -77,7 +77,7 @@ class Outcome:
         seconds: duration.
         problems: problems other than with logs: of the tables over all runs, or of pruning.
         removed: number of old generations removed.
-        notified: what the command of the user was told.
+        notified: what was reported to the command of the user.
     """
 
     lines: tuple[Line, ...]
@@ -132,8 +132,8 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
 
     remaining = _work_through(todo, request, work, note)
     problems, removed = _tidy_up(store, request)
-    left = "not started: see the other errors"
-    lines += [Line(path=one.log.path, run=one.run, state="left", reason=left) for one in remaining]
+    not_started = "not started: see the other errors"
+    lines += [Line(path=one.log.path, run=one.run, state="left", reason=not_started) for one in remaining]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
     lines += [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]

@@ -16,12 +16,12 @@ _SHORT = {"failed", "quarantined", "left", "skipped"}
 
 
 def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
-    """Texts of what the last message did not tell, by what they are about.
+    """Texts of what was not reported yet, by what they are about.
 
     These are logs without results or with losses, logs that cannot show slip, and problems of the batch.
 
     Args:
-        root: the results, which keep what was told.
+        root: the results, which keep what was reported.
         outcome: what came out.
     """
     raised = {
@@ -31,13 +31,13 @@ def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
     }
     raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
     notes = Store(root).notes("batch/notified")
-    told = notes.read("sent") or {}
-    notes.write("sent", {about: text for about, text in raised.items() if about in told})
-    return {about: text for about, text in raised.items() if about not in told}
+    sent = notes.read("sent") or {}
+    notes.write("sent", {about: text for about, text in raised.items() if about in sent})
+    return {about: text for about, text in raised.items() if about not in sent}
 
 
-def tell(root: Path, command: str, content: Mapping[str, object], news: Mapping[str, str]) -> None:
-    """Give a command the JSON of a batch on its standard input; what was told is not news after the next.
+def send(root: Path, command: str, content: Mapping[str, object], news: Mapping[str, str]) -> None:
+    """Give a command the JSON of a batch on its standard input, and remember what was reported.
 
     Args:
         root: the results.
@@ -46,7 +46,7 @@ def tell(root: Path, command: str, content: Mapping[str, object], news: Mapping[
         news: what is new in it.
 
     Raises:
-        BatchError: ``notify_failed``; the next batch tells it again.
+        BatchError: ``notify_failed``; the next batch reports it again.
     """
     try:
         done = subprocess.run(  # noqa: S602 - the user's own command line, which a shell is to read
@@ -63,7 +63,7 @@ def tell(root: Path, command: str, content: Mapping[str, object], news: Mapping[
     except subprocess.TimeoutExpired:
         why = f"it took longer than {_NOTIFY_S:g} s"
     if why:
-        hint = "The same is told again after the next batch"
+        hint = "The same is reported again after the next batch"
         raise BatchError("notify_failed", f"the command of --notify failed: {why}", where=command, hint=hint)
     notes = Store(root).notes("batch/notified")
     notes.write("sent", {**(notes.read("sent") or {}), **news})

@@ -123,11 +123,11 @@ def batch(  # noqa: D417 - the shared choices document themselves
     except Exception as error:
         # No logs, a full disk: nobody looks at the screen of a night.
         what = error if isinstance(error, SlipError) else SlipError("unexpected_error", repr(error), hint="")
-        _tell(Outcome(lines=(), seconds=0.0, problems=(what,)), choices.results, notify)
+        _report(Outcome(lines=(), seconds=0.0, problems=(what,)), choices.results, notify)
         raise
     for problem in outcome.problems:
         print_error(problem)
-    outcome = _tell(outcome, choices.results, notify)
+    outcome = _report(outcome, choices.results, notify)
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
@@ -135,21 +135,21 @@ def batch(  # noqa: D417 - the shared choices document themselves
     return FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
 
 
-def _tell(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
+def _report(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
     """The outcome with what is new in it, which the command of ``--notify`` was given, or why it was not."""
     from pipeline.batch import notices  # noqa: PLC0415 - heavy
 
     if notify is None:
         return outcome
     news = notices.find_news(root, outcome)
-    told = replace(outcome, notified=tuple(news.values()))
+    reported = replace(outcome, notified=tuple(news.values()))
     try:
         if news:
-            notices.tell(root, notify, _as_json(told), news)
+            notices.send(root, notify, _as_json(reported), news)
     except SlipError as error:
         print_error(error)
         return replace(outcome, problems=(*outcome.problems, error))
-    return told
+    return reported
 
 
 def _as_json(outcome: Outcome) -> dict[str, object]:

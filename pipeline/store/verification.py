@@ -116,7 +116,7 @@ class _Examiner:
     def examine(self) -> Examination:
         problems = list(self._unread)
         # A run has a link to its results only when it had a manifest.
-        for home in sorted(self._find_homes(MANIFEST) | self._find_homes(LATEST)):
+        for home in sorted(self._find_run_folders(MANIFEST) | self._find_run_folders(LATEST)):
             problems += [replace(problem, home=home) for problem in self._examine_run(home)]
         problems += self._examine_notes()
         of_all = {name for name in self._names if is_file_name(name) and "/" not in name}
@@ -125,7 +125,7 @@ class _Examiner:
     def _leave_out(self, path: Path, why: str) -> None:
         self._unread.append(Problem(run="", path=path, code="left_out", what=why))
 
-    def _find_homes(self, name: str) -> set[str]:
+    def _find_run_folders(self, name: str) -> set[str]:
         """Folders of runs that hold a name."""
         folders = {path.removesuffix(f"/{name}") for path in self._names if path.endswith(f"/{name}")}
         # A generation's folder may hold a file of any name, and runs may stand beside it.
