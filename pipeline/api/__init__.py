@@ -21,6 +21,7 @@ from pipeline.api.fitted_model import (
     Model,
     StoredRun,
     effect,
+    load_effects,
     tabulate_ladder,
     tabulate_parameters,
     take_file,

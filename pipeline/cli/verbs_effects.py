@@ -16,8 +16,8 @@ from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     All,
     Choices,
+    OwnEffects,
     Results,
-    TrustCode,
     build_options,
     exit_code,
     limited_memory,
@@ -47,7 +47,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     model: Annotated[
         Path | None, Parameter(help="model that is known: only effects beyond it are estimated")
     ] = None,
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     vehicle_of: Annotated[
         Literal["model", "run"] | None,
         Parameter(help="geometry to use where the run is of another vehicle than --model"),
@@ -64,7 +64,6 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     From one run, or from several of one vehicle jointly: all that are given, or that a folder holds.
 
     Args:
-        trust_code: trust the Python that the model file names, now and later.
         memory: memory limit, for example 2GB (default: 80 % of the machine's).
         budget: CPU time that a search may take, for example 60s (default: 60s for up to 10 minutes of
             driving, more for longer runs); after it the best answer so far is given.
@@ -74,7 +73,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """
     if apply is not None:
         models.check_target(apply)
-    known = _open_model(model, trust_code=trust_code)
+    models.load_effects(effects or ())
+    known = None if model is None else models.read_model(model)
     budget_s = None if budget is None else estimation.parse_budget(budget)
     diagnosed = Diagnosed()
 
@@ -90,11 +90,11 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     if apply is not None:
         diagnosed.errors += _apply(diagnosed.answers, apply, quiet=quiet or json)
     if json:
-        omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({**diagnosed.to_json(), **omitted})
+        print_json(diagnosed.to_json())
     elif not quiet:
         chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
-        said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
+        said = spell_choices(choices) + spell_flags(chosen)
+        said += "".join(spell_flags({"effects": path}) for path in effects or ())
         print_lines(diagnosed.list_lines(logs, said, apply, everything=everything))
     return diagnosed.end(quiet=quiet)
 
@@ -200,15 +200,6 @@ def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | N
     if suggested := next((one.run for one in runs if one.has_suggestion), None):
         return f"slip serve {shlex.quote(suggested)}    add the suggested term there"
     return applying
-
-
-def _open_model(path: Path | None, *, trust_code: bool) -> models.ModelFile | None:
-    """The named model, if one is named."""
-    if path is None:
-        return None
-    from pipeline.cli.model_runs import open_model  # noqa: PLC0415 - only with a model
-
-    return open_model(path, trust_code=trust_code)
 
 
 def _gather(
@@ -347,6 +338,7 @@ def effects(  # noqa: D417 - the arguments document themselves
     effect: Annotated[str | None, Parameter(help="id of an effect; without one, all are listed")] = None,
     /,
     *,
+    own: OwnEffects = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -360,7 +352,9 @@ def effects(  # noqa: D417 - the arguments document themselves
     """
     from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
 
-    chosen = models.list_effects() if effect is None else (models.find_effect(effect),)
+    models.load_effects(own or ())
+    every = (*models.list_effects(), *models.list_own_effects().values())
+    chosen = every if effect is None else (models.find_effect(effect),)
     pages = models.list_pages(chosen) if effect is None else [format_effect(chosen[0])]
     content = {"effects": [_as_json(item) for item in chosen]}
     return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
@@ -401,7 +395,7 @@ def export(  # noqa: D417 - the results folder documents itself
     model: Path | None = None,
     input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word people use for it
     frame: str = "map",
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     results: Results = Path("results"),
     json: bool = False,
     quiet: bool = False,
@@ -417,7 +411,6 @@ def export(  # noqa: D417 - the results folder documents itself
         model: a model file whose velocity and predicted path are exported too (default: the diagnosed model).
         input: input of the model (default: the command where there is one).
         frame: fixed frame of the log's poses.
-        trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -427,7 +420,8 @@ def export(  # noqa: D417 - the results folder documents itself
     from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
-    known = _open_model(model, trust_code=trust_code)
+    models.load_effects(effects or ())
+    known = None if model is None else models.read_model(model)
     chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
     source = ExportSource(manifest, chosen, input or named_on, frame)
     path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
@@ -441,8 +435,7 @@ def export(  # noqa: D417 - the results folder documents itself
         }[to]
         written = [write(source, path)]
     files = [str(each) for each in written]
-    omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-    content = {"run": manifest.run, "to": to, "files": files, **omitted}
+    content = {"run": manifest.run, "to": to, "files": files}
     return print_result(content, lambda: files, json=json, quiet=quiet)
 
 

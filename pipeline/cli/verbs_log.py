@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import models
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
     All,
     Choices,
-    TrustCode,
+    OwnEffects,
     build_options,
     exit_code,
     format_vehicle_source,
@@ -36,7 +37,6 @@ from pipeline.cli.conventions import (
     spell_choices,
     summarize_error,
 )
-from pipeline.cli.model_runs import trust_named
 from pipeline.core import (
     FigureFormat,
     SlipError,
@@ -72,7 +72,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     report: Annotated[bool, Parameter(negative="--no-report")] = True,
     figures: FigureFormat | None = None,
     model: Path | None = None,
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     force: bool = False,
     memory: str | None = None,
     everything: All = False,
@@ -85,7 +85,6 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         diagnosis: identify the effects that the model lacks.
         report: write report.html.
         model: a model file to compute slip relative to as well.
-        trust_code: trust the Python that the model file names, now and later.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         memory: memory limit, for example 2GB (default: 80 % of the machine's).
@@ -93,7 +92,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    trust_named(model, wanted=trust_code)
+    models.load_effects(effects or ())
     options = build_options(choices)
     options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
     outcomes: list[Outcome] = []

@@ -68,9 +68,7 @@ def add_model(
     from pipeline.estimation.prediction import predict_at  # noqa: PLC0415 - heavy
 
     slip, model = _remove_model(slip), file.model
-    findings = [
-        Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings
-    ]
+    findings: list[Finding] = []
     if model.vehicle.kind != vehicle.kind:
         what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
         raise MotionError("wrong_model", what, where=where, hint="Give a model of this vehicle.")

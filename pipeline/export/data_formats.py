@@ -39,7 +39,7 @@ def write_json_object(file: ModelFile, current: Current) -> str:
             item["learned"] = learned_as_table(effect)
         effects.append(item)
     stand_ins = pick(vehicle, *vehicle.stand_ins)
-    warnings = [*file.warnings, *filter(None, [vehicle.format_unknown()])]
+    warnings = list(filter(None, [vehicle.format_unknown()]))
     content = {
         "vehicle": {
             **pick(vehicle, "id", "name", "kind", *_GEOMETRY),

@@ -9,23 +9,21 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.models.catalogue import (
-        distrust,
         draft_effect,
         explain_idle,
         find_effect,
         find_late_effect,
         is_own,
         list_effects,
+        list_own_effects,
         list_pages,
-        list_trusted,
+        load_effects,
         name_effect,
         name_number,
         name_parameter,
         name_term,
-        read_code,
         refuse_taken,
         suggest_manoeuvre,
-        trust,
     )
     from pipeline.models.effect import (
         ANY,
@@ -56,7 +54,7 @@ if TYPE_CHECKING:
     )
     from pipeline.models.literature import MODELS, LiteratureModel, find_model, list_models
     from pipeline.models.model import ForwardModel, Model, Timing, replace_context
-    from pipeline.models.model_file import ModelFile, list_code, parse_model, read_model
+    from pipeline.models.model_file import ModelFile, parse_model, read_model
     from pipeline.models.model_text import (
         check_target,
         format_effect,

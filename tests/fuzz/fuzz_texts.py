@@ -156,7 +156,7 @@ def write_models() -> list[str]:
     fit = (
         '[fit]\ninput = "command"\nblocks = 3\n[[fit.runs]]\nrun = "a/b"\nsha256 = "ab"\npose_delay_s = 0.1\n'
     )
-    texts.append(f'effects = ["own.py"]\n{head}[[effect]]\nid = "tilt"\nk = 0.5\n{fit}')
+    texts.append(f'{head}[[effect]]\nid = "tilt"\nk = 0.5\n{fit}')
     return texts
 
 

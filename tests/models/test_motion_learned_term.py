@@ -238,10 +238,7 @@ def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(ground
 def test_the_verbs_add_show_and_drop_it(log: Path, tmp_path: Path) -> None:
     model, on = tmp_path / "m.toml", ("--on", log, "--results", tmp_path / "results")
     # Without its lag the model leaves what changes of velocity tell of.
-    assert (
-        run_verb("model", "new", model, "--vehicle", "husky_a200", "--effects", "effective_track").returncode
-        == 0
-    )
+    assert run_verb("model", "new", model, "effective_track", "--vehicle", "husky_a200").returncode == 0
     assert run_verb("model", "fit", model, *on, "--quiet").returncode == 0
     done = run_verb("model", "add", model, "learned_term", *on, "--json")
     assert done.returncode == 0, done.stderr

@@ -135,9 +135,7 @@ def test_a_fold_is_learned_without_its_stretches(data: EstimationData) -> None:
 
 def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Path, tmp_path: Path) -> None:
     model = tmp_path / "lagging.toml"
-    made = run_verb(
-        "model", "new", model, "--vehicle", "husky_a200", "--effects", "drive_lag", "effective_track"
-    )
+    made = run_verb("model", "new", model, "drive_lag", "effective_track", "--vehicle", "husky_a200")
     assert made.returncode == 0, made.stderr
     on = ("--on", log, "--results", tmp_path / "results")
     done = run_verb("model", "compare", model, "--against", "literature", "learned", *on, "--json")
