@@ -384,7 +384,7 @@ def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
 VERSIONS: Mapping[str, int] = {"extract": 21, "velocity": 7, "slip": 22, "aggregate": 4}
 
 
-EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
+EXTRACTED = ("commands", "wheels", "poses", "imu")
 
 
 TABLES: Mapping[str, tuple[str, ...]] = {

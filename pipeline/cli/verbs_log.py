@@ -169,7 +169,7 @@ def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> 
 _OTHER_CLOCK_S = 3600.0
 """Largest offset of stamps of the same clock as log time [s]; others are simulated, since boot, or unset."""
 _LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
-_ROLES = ("command", "wheels", "pose", "imu", "interval", "power")
+_ROLES = ("command", "wheels", "pose", "imu", "interval")
 
 
 def inspect(  # noqa: D417 - the shared choices document themselves
@@ -298,9 +298,9 @@ def _format_roles(seen: Inspection, *, everything: bool) -> list[str]:
     for role in _ROLES if seen.sources else ():
         if source := getattr(seen.sources, role):
             lines.append(f"{role:<10}{source}    {source.reason}")
-        elif role not in {"interval", "power"}:
+        elif role != "interval":
             lines.append(f"{role:<10}none")
-        elif everything and role == "interval":
+        elif everything:
             lines.append(f"{role:<10}none: the whole log counts")
         others = len(seen.choice.ratings) - 1 if seen.choice else 0
         if role == "pose" and others > 0 and not everything:

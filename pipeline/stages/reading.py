@@ -247,11 +247,6 @@ def list_wanted(
             if imu.orientation:
                 names += [*axis_fields(imu.orientation, "xyzw"), *filter(None, [imu.frame])]
             signals += [Signal(sources.imu.topic, name) for name in names]
-    if sources.power is not None:
-        signals += [
-            replace(signal, field=signal.fields()[0])
-            for signal in (*sources.power.currents, *sources.power.voltages)
-        ]
     if sources.interval is not None:
         signals.append(Signal(sources.interval.topic, "data"))
     by_topic: dict[str, list[str]] = {}

@@ -88,14 +88,6 @@ def test_cells_on_earth_are_polygons_of_their_size(earth: Path) -> None:
     assert "What to expect by place" in written["terrain.html"].read_text(encoding="utf-8")
 
 
-def test_power_comes_from_the_battery(earth: Path) -> None:
-    cells = draw_up_terrain(Store(earth / "results")).cell_table
-    power = cells["power"].drop_nulls()
-    # The simulated robot idles at 40 W and rolls against 120 N at up to 2 m/s.
-    assert power.len() > 0.9 * cells.height
-    assert 40.0 < float(np.median(power.to_numpy())) < 280.0
-
-
 def test_a_run_whose_log_has_gone_or_changed_is_not_placed_by_it(earth: Path, tmp_path: Path) -> None:
     log = record(tmp_path / "c.mcap", platform="panther", seed=7)
     analyze(log, tmp_path / "results")
