@@ -30,7 +30,6 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
 
     for folder, pattern in (
         ("pipeline/sources/presets", "*.toml"),
-        ("pipeline/logs/text_folders", "*.toml"),
         ("schemas", "*.py"),
         ("slip", "*.*"),
         ("pipeline/report", "page.*"),
