@@ -34,7 +34,6 @@ from pipeline.simulate.facts import (
     unknown_name,
 )
 from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
-from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
 from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, list_topics, publish
 from pipeline.simulate.programs import read_played
@@ -258,12 +257,11 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Case:
-    """A named scenario and what it shows, in one line; a machine when it is built of rigid bodies."""
+    """A named scenario and what it shows, in one line."""
 
     name: str
     shows: str
     scenario: Scenario
-    machine: SkidSteer | None = None
 
 
 def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
@@ -300,11 +298,8 @@ for _name, _given in read_facts("bases.toml").items():
 
 
 def _make_case(name: str, given: dict[str, Any]) -> Case:
-    shows, base, machine = given.pop("shows"), _BASES[given.pop("base")], given.pop("machine", None)
-    if isinstance(machine, str):
-        machine = {"base": machine}
-    made = None if machine is None else _change(MACHINES[machine.pop("base")], machine)
-    return Case(name, shows, _change_scenario(base, given), made)
+    shows, base = given.pop("shows"), _BASES[given.pop("base")]
+    return Case(name, shows, _change_scenario(base, given))
 
 
 CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml").items())
@@ -385,13 +380,11 @@ def simulate_case(
     """
     scenario = make_scenario(name, effects, **changes)
     if play is not None:
-        scenario = _play(scenario, play, name)
+        scenario = _play(scenario, play)
     target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        machine = None if name is None else find_case(name).machine
-        run = simulate_run(scenario) if machine is None else simulate_skid_steer(scenario, machine)
-        write_log(run, target)
+        write_log(simulate_run(scenario), target)
     except OSError as problem:
         what = f"the log cannot be written ({problem.strerror})"
         raise SimulateError(
@@ -400,17 +393,10 @@ def simulate_case(
     return target
 
 
-def _play(scenario: Scenario, path: Path, name: str | None) -> Scenario:
+def _play(scenario: Scenario, path: Path) -> Scenario:
     """The scenario driven with the commands of a recording."""
-    _refuse_machine(name, "drives its own program", "Leave --play out")
     played = read_played(path, scenario.vehicle)
     return replace(scenario, played=played, duration_s=max(float(played.time_s[-1]) + 0.5, 1.0))
-
-
-def _refuse_machine(name: str | None, why: str, hint: str) -> None:
-    if name is not None and find_case(name).machine is not None:
-        what, hint = f"a case of rigid bodies {why}", f"{hint} or choose another case"
-        raise SimulateError("wrong_vehicle", what, where=name, hint=hint)
 
 
 def make_scenario(
@@ -427,8 +413,6 @@ def make_scenario(
 ) -> Scenario:
     """The scenario of a named case with changes; see `Changes`."""
     scenario = Scenario() if name is None else find_case(name).scenario
-    if vehicle or platform:
-        _refuse_machine(name, "keeps its own vehicle", "Leave the vehicle out")
     if vehicle is not None:
         usual = replace(scenario.recording, layout="usual")
         scenario = replace(scenario, vehicle=find_vehicle(vehicle), recording=usual)
