@@ -309,7 +309,7 @@ def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configu
 
 MOST_POSES = 40
 """Maximum number of poses whose content is compared: each costs a reading of the drive's topics, too, and the
-platforms of `pipeline/simulate/platforms` record at most ten."""
+platforms of `tests/fixtures/platforms` record at most ten."""
 _NAMED = 5
 """Maximum number of topics that a finding names."""
 

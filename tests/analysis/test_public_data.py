@@ -10,11 +10,11 @@ from fomo_session import EFFECTIVE_TRACK, write_session
 from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from simulated_platforms import simulate_platform
 from verbs import run_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.simulate import simulate_case
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -69,7 +69,7 @@ def as_bag(log: Path) -> Path:
 def test_a_bag_of_ros_1_is_recognized_and_its_effect_is_named(
     tmp_path: Path, platform: str, effects: dict[str, float], lacks: str
 ) -> None:
-    log = simulate_case(None, effects, out=tmp_path / "run.mcap", seed=3, duration_s=90.0, platform=platform)
+    log = simulate_platform(platform, effects, out=tmp_path / "run.mcap", seed=3, duration_s=90.0)
     bag = as_bag(log)
     log.unlink()
     said = json.loads(run_verb("inspect", bag, "--json").stdout)
@@ -81,7 +81,7 @@ def test_a_bag_of_ros_1_is_recognized_and_its_effect_is_named(
 
 
 def test_a_topic_that_is_not_what_its_type_says_serves_where_it_is_named(tmp_path: Path) -> None:
-    log = simulate_case(None, {}, out=tmp_path / "run.mcap", seed=3, duration_s=20.0, platform="tartandrive")
+    log = simulate_platform("tartandrive", {}, out=tmp_path / "run.mcap", seed=3, duration_s=20.0)
     assert json.loads(run_verb("inspect", log, "--json").stdout)["roles"]["command"] is None
     (tmp_path / "run.toml").write_text('[command]\ntopic = "/cmd"\n', encoding="utf-8")
     named = json.loads(run_verb("inspect", log, "--json").stdout)["roles"]["command"]
