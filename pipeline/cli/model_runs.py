@@ -273,13 +273,7 @@ def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:
     return values
 
 
-Against = Annotated[
-    list[Literal["literature", "learned"]] | None,
-    Parameter(
-        help="compare with models of the literature, or with learned ones (the extra learn)",
-        consume_multiple=True,
-    ),
-]
+Against = Annotated[Literal["literature"] | None, Parameter(help="compare with models of the literature")]
 
 
 def literature(name: str | None = None, /, *, json: bool = False) -> int:
@@ -330,24 +324,21 @@ def _format_model(model: models.LiteratureModel) -> list[str]:
     return [*lines, f"source    {source}"]
 
 
-def compare_rivals(
-    files: Mapping[str, models.ModelFile], spoken: On, against: list[Literal["literature", "learned"]]
-) -> int:
-    """Fit models, those of the literature and learned ones to runs, and print their held-out errors.
+def compare_rivals(files: Mapping[str, models.ModelFile], spoken: On) -> int:
+    """Fit models and those of the literature to runs, and print their held-out errors.
 
     Args:
         files: models by the name of their file; may be empty.
         spoken: the runs, and how the answer is printed.
-        against: what they are compared with.
     """
     from pipeline.words import format_contest  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)
     vehicle, runs = gather_runs(spoken.on, known, spoken.vehicle_of, spoken.results, quiet=quiet)
-    contest = datasets.contest_models(files, runs, vehicle, against, spoken.input)
+    contest = datasets.contest_models(files, runs, vehicle, spoken.input)
     warnings = [contest.chosen.warning] if contest.chosen.warning else []
-    if "literature" in against and len(models.list_models(vehicle)) == 1:
+    if len(models.list_models(vehicle)) == 1:
         warnings.append(
             f"no model of the literature but the ideal one describes a {vehicle.kind} vehicle: "
             "`slip model literature` lists each model with its vehicles"

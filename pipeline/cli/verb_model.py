@@ -42,7 +42,6 @@ from pipeline.cli.model_runs import (
 from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.transfer import Transfer
     from pipeline.run import MotionRun
 
@@ -113,8 +112,6 @@ def show(  # noqa: D417 - the shared option documents itself
     parameters = words.format_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     lines += _list_idle(file.model)
-    term = models.find_learned(file.model)
-    lines += [] if term is None else models.describe_learned(term)
     if runs := file.list_fitted("runs"):
         source = str(file.fit.get("input"))
         names = ", ".join(str(run.get("run")) for run in runs)
@@ -135,7 +132,7 @@ def add(  # noqa: D417 - the shared options document themselves
 
     Args:
         model: the model file.
-        ids: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
+        ids: ids of effects, as `slip effects` lists them.
         anyway: add the effects even if the data do not support them.
     """
     file = open_model(model, spoken.effects)
@@ -203,14 +200,12 @@ def compare(  # noqa: D417 - the shared options document themselves
     """Compare two models, with their present values, on runs.
 
     A fit of each to the runs is shown as well. With --against, the given models
-    and models of the literature, or learned ones, are fitted to the runs, and their held-out errors compared.
+    and models of the literature are fitted to the runs, and their held-out errors compared.
 
     Args:
         model: a model file; with --against it may be left out.
         other: another one.
     """
-    from pipeline.estimation.across_runs import describe_coverage  # noqa: PLC0415
-    from pipeline.estimation.learned_step import check_bands  # noqa: PLC0415
     from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
 
@@ -219,20 +214,18 @@ def compare(  # noqa: D417 - the shared options document themselves
         require_models(model, other)
     opened = [open_model(path, spoken.effects) for path in paths]
     if against is not None:
-        return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken, against)
+        return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken)
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both models use the same input, so that their errors are comparable.
     last = {file.last_input for file, _ in files}
     effects = [effect for file, _ in files for effect in file.model]
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
-    held: list[dict[str, Coverage]] = []
     own_runs: list[str] = []
     for path, (file, runs) in zip(paths, files, strict=True):
         own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in runs}
         seen = "its error there is not a held-out error"
         own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
-        held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
         carried = carry_over(
             file.model,
             runs,
@@ -247,16 +240,12 @@ def compare(  # noqa: D417 - the shared options document themselves
             {
                 "input": chosen.source.value,
                 "input_reason": chosen.reason,
-                "compared": [
-                    {**_transfer_as_json(name, item), "bands_hold": {k: vars(v) for k, v in one.items()}}
-                    for (name, item), one in zip(rows, held, strict=True)
-                ],
+                "compared": [_transfer_as_json(name, item) for name, item in rows],
                 "warnings": warnings,
             }
         )
     elif not spoken.quiet:
         print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
-        print_lines([text for one in held for text in describe_coverage(one)])
         print_warnings(warnings)
     return CLEAN
 

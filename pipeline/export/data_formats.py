@@ -8,7 +8,7 @@ from datetime import date, time
 
 from pipeline.core import finite_or_none, pick
 from pipeline.export import Amount, Current, Facts, Target, require_plausible, start_table, write_yaml
-from pipeline.models import FormulaEffect, ModelFile, Quantity, ResidualTerm, learned_as_table
+from pipeline.models import FormulaEffect, ModelFile, Quantity
 from pipeline.run import find_limits, trace_traction
 
 _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track_multiplier")
@@ -35,8 +35,6 @@ def write_json_object(file: ModelFile, current: Current) -> str:
         }
         if isinstance(effect, FormulaEffect):
             item["formulas"] = effect.formulas
-        if isinstance(effect, ResidualTerm):
-            item["learned"] = learned_as_table(effect)
         effects.append(item)
     stand_ins = pick(vehicle, *vehicle.stand_ins)
     warnings = list(filter(None, [vehicle.format_unknown()]))

@@ -38,20 +38,6 @@ if TYPE_CHECKING:
     from pipeline.models.expression import Expression
     from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written, list_terms
     from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-    from pipeline.models.learned_term import (
-        INPUTS,
-        LEARNED,
-        LEAST_WAY_M,
-        Bands,
-        InputProbe,
-        LearnedInput,
-        ResidualTerm,
-        describe_learned,
-        drop_learned,
-        find_kind,
-        find_learned,
-        learned_as_table,
-    )
     from pipeline.models.literature import MODELS, LiteratureModel, find_model, list_models
     from pipeline.models.model import ForwardModel, Model, Timing, replace_context
     from pipeline.models.model_file import ModelFile, parse_model, read_model

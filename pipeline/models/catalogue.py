@@ -20,7 +20,6 @@ from pipeline.core import guess_names, naming_os_errors, read_bounded, suffix_un
 from pipeline.models.effect import Effect, Excitation, Late, Parameter, Search, find_late
 from pipeline.models.families import check_formula
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.parameter import is_of_one_run
 from pipeline.models.words import find_words
 from pipeline.run import MotionError
@@ -57,9 +56,7 @@ def find_effect(name: str) -> EffectClass:
     Raises:
         MotionError: ``unknown_effect``, with the nearest ids.
     """
-    # A learned term is not in the folder, as it is never reported as a cause.
-    every: tuple[EffectClass, ...] = (*list_effects(), ResidualTerm)
-    known = {effect.id: effect for effect in every}
+    known = {effect.id: effect for effect in list_effects()}
     found = known.get(name) or list_own_effects().get(name)
     if found is None:
         near = guess_names(name, known)

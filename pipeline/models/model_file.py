@@ -13,7 +13,6 @@ from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, r
 from pipeline.models.catalogue import find_effect, refuse_taken
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-from pipeline.models.learned_term import parse_learned
 from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run import MotionError
@@ -21,7 +20,7 @@ from pipeline.sources import ConfigurationError, StandIn, Vehicle, VehicleSectio
 
 FORMAT = 1
 """Version of the format of model files; other versions are rejected."""
-_SECTIONS = ("format", "vehicle", "effect", "learned", "fit", "note")
+_SECTIONS = ("format", "vehicle", "effect", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
 _ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."
 _ID = re.compile(r"[^\W\d][\w-]{0,63}")
@@ -218,8 +217,6 @@ class _Reader:
                 Model(vehicle, tuple(effects))
             except MotionError as error:
                 raise self._repeat(error, ("effect", number), "id") from error
-        if "learned" in self.tree:
-            effects.append(parse_learned(self.tree["learned"], self._locate(None, "learned")))
         return effects
 
     def _vehicle(self) -> Vehicle:

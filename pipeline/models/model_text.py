@@ -14,16 +14,10 @@ from pipeline.models.effect import (
     Parameter,
 )
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.learned_term import LEARNED, find_learned, learned_as_table
 from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.run import MotionError
 from pipeline.sources import FLEET_FILE, RANGES, RUN_FILE, Vehicle, find_preset, is_model
 from pipeline.store import replace_file
-
-_LEARNED_HEAD = (
-    "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
-    "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",
-)
 
 
 def write_model(file: ModelFile, path: Path) -> None:
@@ -73,11 +67,7 @@ def format_model(file: ModelFile) -> str:
         lines.append(f"note = {format_value(file.note)}")
     lines += ["", *_format_vehicle(file.model.vehicle)]
     for effect in file.model:
-        if effect.id == LEARNED:
-            continue
         lines += ["", *_list_lines(effect, file)]
-    if (term := find_learned(file.model)) is not None:
-        lines += ["", *_LEARNED_HEAD, *_format_table("learned", learned_as_table(term))]
     if file.fit:
         lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
     return "\n".join(lines) + "\n"

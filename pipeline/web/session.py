@@ -21,7 +21,6 @@ from pipeline.models import (
     Model,
     ModelFile,
     Parameter,
-    ResidualTerm,
     format_model,
     list_effects,
     list_own_effects,
@@ -256,7 +255,6 @@ def list_formulas(effect: Effect) -> list[str]:
 
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
     """Every effect that exists on a vehicle, ordered from the command to the pose."""
-    every: tuple[type[Effect], ...] = (*list_effects(), *list_own_effects().values(), ResidualTerm)
     return [
         {
             "id": effect.id,
@@ -264,7 +262,7 @@ def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
             "about": summarize_effect(effect),
             "acts_on": effect.place.name.lower(),
         }
-        for effect in every
+        for effect in (*list_effects(), *list_own_effects().values())
         if vehicle.kind in effect.kinds
     ]
 
