@@ -286,8 +286,9 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
         json: print one JSON object.
     """
     if name is None:
-        rows = [_list_model(model) for model in models.MODELS]
-        return print_result({"models": [_as_json(model) for model in models.MODELS]}, lambda: rows, json=json)
+        every = models.list_literature()
+        content = {"models": [_as_json(model) for model in every]}
+        return print_result(content, lambda: [_list_model(model) for model in every], json=json)
     model = models.find_model(name)
     return print_result(_as_json(model), lambda: _format_model(model), json=json)
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipeline.models.expression import Expression
     from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written, list_terms
     from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-    from pipeline.models.literature import MODELS, LiteratureModel, find_model, list_models
+    from pipeline.models.literature import LiteratureModel, find_model, list_literature, list_models
     from pipeline.models.model import ForwardModel, Model, Timing, replace_context
     from pipeline.models.model_file import ModelFile, parse_model, read_model
     from pipeline.models.model_text import (

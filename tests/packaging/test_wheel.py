@@ -30,6 +30,7 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
 
     for folder, pattern in (
         ("pipeline/sources/presets", "*.toml"),
+        ("pipeline/models/literature", "*.toml"),
         ("schemas", "*.py"),
         ("slip", "*.*"),
         ("pipeline/report", "page.*"),
