@@ -381,10 +381,9 @@ class Model:
         """Its values as parameters of what people run, as `slip model export` writes them.
 
         Args:
-            to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, simulator,
-                json or python.
-            current: for vesc and px4 the robot's file of parameters, which is corrected; for simulator the
-                simulator's own export.
+            to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or
+                python.
+            current: for vesc and px4 the robot's file of parameters, which is corrected.
             gate: for autoware whether the steering offset is applied: off, on, or on and learned on.
         """
         return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)

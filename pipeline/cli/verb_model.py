@@ -295,10 +295,7 @@ def export(  # noqa: D417 - the options document themselves
     to: str,
     current: Annotated[
         Path | None,
-        Parameter(
-            help="vesc, px4: the robot's file of parameters, which is corrected; "
-            "simulator: the simulator's own export"
-        ),
+        Parameter(help="vesc, px4: the robot's file of parameters, which is corrected"),
     ] = None,
     on: Annotated[
         list[str] | None,
@@ -320,8 +317,7 @@ def export(  # noqa: D417 - the options document themselves
 
     Args:
         model: the model file.
-        to: ros2_control, nav2, nav2_amcl, nav2_traction, autoware, vesc, px4, robot_localization, gazebo,
-            simulator, traction, json or python.
+        to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
 

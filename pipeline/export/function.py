@@ -273,5 +273,5 @@ PYTHON = Target(
     "python",
     "a function that predicts poses from commands",
     "the function's docstring",
-    lambda file, _current: write_function(file.model),
+    write_file=lambda file: write_function(file.model),
 )

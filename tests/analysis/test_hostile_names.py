@@ -62,7 +62,7 @@ def test_names_of_a_log_are_data_in_every_file_that_is_made_of_it(
             assert any(one in answer.stderr for one in refusals)
             continue
         text = answer.stdout
-        if target.name in {"python", "traction"}:
+        if target.name == "python":
             space: dict[str, object] = {}
             exec(compile(ast.parse(text), "exported", "exec"), space)  # noqa: S102 - that is what it is for
             assert space["VEHICLE"] == NAME

@@ -74,11 +74,6 @@ GEOMETRY = {
 }
 EXTREMES = (0.0, -0.0, -1.0, 1e-300, 5e-324, 1e-12, 1e9, 1e12, 1e154, 1e300, -1e300, 1.7976931348623157e308)
 OWN_FILES = {
-    "simulator": (
-        "simulated_base:\n  ros__parameters:\n    speeds_mps: [0.25, 0.5, 0.75, 1.0]\n"
-        "    linear_factor: [1.0, 1.0, 0.9, 0.9]\n    angular_factor: [0.6, 0.6, 0.5, 0.5]\n"
-        "    linear_lag_s: 0.3\n"
-    ),
     "px4": "# Vehicle-Id Component-Id Name Value Type\n1\t1\tRO_MAX_THR_SPEED\t2.5\t9\n",
     "vesc": (
         "/**:\n  ros__parameters:\n    speed_to_erpm_gain: 4614.0\n"

@@ -37,7 +37,6 @@ HANG_S = 10
 PARSERS = {
     "json": json.loads,
     "python": ast.parse,
-    "traction": ast.parse,
     "gazebo": ET.fromstring,
     "px4": find_target("px4").read_current,
 }
