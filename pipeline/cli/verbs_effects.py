@@ -381,6 +381,7 @@ def _as_json(effect: type[models.Effect]) -> dict[str, object]:
 _SUFFIXES = {
     "mcap": "_slip.mcap",
     "csv": "_csv",
+    "parquet": "_parquet",
     "foxglove-layout": "_foxglove.json",
     "plotjuggler-layout": "_plotjuggler.xml",
 }
@@ -390,62 +391,46 @@ def export(  # noqa: D417 - the results folder documents itself
     run: Annotated[str, Parameter(help="name of a run, or its log")],
     /,
     *,
-    to: Literal["mcap", "csv", "foxglove-layout", "plotjuggler-layout"],
+    to: Literal["mcap", "csv", "parquet", "foxglove-layout", "plotjuggler-layout"],
     file: Path | None = None,
     model: Path | None = None,
-    input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word people use for it
     frame: str = "map",
     effects: OwnEffects = None,
     results: Results = Path("results"),
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Export a run as a log, as CSV, or as layouts for viewers.
+    """Export a run as a log, as tables, or as layouts for viewers.
 
     The log can be opened together with the original one.
 
     Args:
         run: name of a run, or its log.
         to: what to write.
-        file: output file (csv: folder); by default in the current folder, named after the run.
-        model: a model file whose velocity and predicted path are exported too (default: the diagnosed model).
-        input: input of the model (default: the command where there is one).
+        file: output file (csv, parquet: folder); by default in the current folder, named after the run.
+        model: a model file whose velocity is exported too (default: the diagnosed model).
         frame: fixed frame of the log's poses.
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report import viewer_files  # noqa: PLC0415
-    from pipeline.report.export_source import ExportSource  # noqa: PLC0415
-    from pipeline.report.viewer_files import write_csv, write_derived_log  # noqa: PLC0415 - heavy
+    from pipeline.estimation.stored_diagnosis import read_slip  # noqa: PLC0415 - heavy
+    from pipeline.report.viewer_files import (  # noqa: PLC0415 - heavy
+        write_layout,
+        write_slip_log,
+        write_tables,
+    )
     from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
     models.load_effects(effects or ())
     known = None if model is None else models.read_model(model)
-    chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
-    source = ExportSource(manifest, chosen, input or named_on, frame)
     path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
-    if to == "csv":
-        written = write_csv(source, path)
+    if to in {"csv", "parquet"}:
+        written = write_tables(manifest, to, path)
+    elif to == "mcap":
+        written = [write_slip_log(manifest, read_slip(manifest, known), path, frame)]
     else:
-        write = {
-            "mcap": write_derived_log,
-            "foxglove-layout": viewer_files.write_foxglove_layout,
-            "plotjuggler-layout": viewer_files.write_plotjuggler_layout,
-        }[to]
-        written = [write(source, path)]
+        written = [write_layout(to, path)]
     files = [str(each) for each in written]
     content = {"run": manifest.run, "to": to, "files": files}
     return print_result(content, lambda: files, json=json, quiet=quiet)
-
-
-def _find_named(manifest: Manifest) -> tuple[models.Model | None, str | None]:
-    """The model of the run's diagnosis, and its input; None if there is none."""
-    from pipeline.estimation.stored_diagnosis import read_stored_diagnosis  # noqa: PLC0415 - heavy
-    from pipeline.results import read_model  # noqa: PLC0415 - heavy
-
-    diagnosis = read_stored_diagnosis(manifest)
-    file = None if diagnosis is None else read_model(diagnosis)
-    if diagnosis is None or file is None:
-        return None, None
-    return file.model, diagnosis.input or None

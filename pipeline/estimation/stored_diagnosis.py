@@ -94,6 +94,24 @@ def add_model(
     return pl.concat(parts), tuple(findings)
 
 
+def read_slip(manifest: Manifest, file: ModelFile | None = None) -> pl.DataFrame:
+    """Table `slip` of a stored run, with the velocity of a model in place of the diagnosed one.
+
+    Args:
+        manifest: the run.
+        file: the model; None for what was diagnosed.
+
+    Raises:
+        MotionError: the model is of another kind of vehicle.
+    """
+    slip = manifest.read("slip")
+    if file is None:
+        return slip
+    tables = {name: manifest.read(name) for name in manifest.tables if name in _TABLES}
+    length, vehicle = read_length_scale(manifest), load_vehicle(manifest)
+    return add_model(slip, tables, file, vehicle, length=length, where=manifest.run)[0]
+
+
 def _remove_model(slip: pl.DataFrame) -> pl.DataFrame:
     """Table `slip` with empty model columns."""
     return slip.with_columns(pl.lit(None, pl.Float64).alias(name) for name in _MODEL_COLUMNS)

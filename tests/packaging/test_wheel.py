@@ -34,6 +34,7 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
         ("schemas", "*.py"),
         ("slip", "*.*"),
         ("pipeline/report", "page.*"),
+        ("pipeline/report/layouts", "*"),
         ("pipeline/report", "*.js"),
         ("pipeline/report/templates", "**/*.html"),
         ("pipeline/report", "catalogue.*"),
