@@ -255,10 +255,8 @@ def tie_to_fleet(data: EstimationData, model: models.Model, out: Path) -> Estima
     Raises:
         SlipError: see `forecast_runs`.
     """
-    from pipeline.estimation.across_runs import tie_to_prior  # noqa: PLC0415 - heavy
-
     forecast = forecast_runs(data.runs, model.vehicle, data.source.value, out)
-    return tie_to_prior(data, forecast.prior)
+    return data.with_prior(forecast.prior)
 
 
 def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:

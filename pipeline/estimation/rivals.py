@@ -114,7 +114,9 @@ class Contest:
 
 def judge_rival(data: EstimationData, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
     """Fit a model to runs and score it as the ladder scores its steps."""
-    return judge_fit(data, name, *time_fit(data, model, per_run))
+    fitted, fit_s = time_fit(data, model, per_run)
+    numbers = len({number.label for number in fitted.free if number.effect})
+    return Rival(name, numbers, hold_out(data, fitted), fit_s)
 
 
 def time_fit(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, float]:
@@ -123,12 +125,6 @@ def time_fit(data: EstimationData, model: Model, per_run: Sequence[str] = ()) ->
     active = model.keep(effect.id for effect in data.active_effects(model))
     fitted = fit_model(data, active, per_run=per_run, exact=True)
     return fitted, time.process_time() - start
-
-
-def judge_fit(data: EstimationData, name: str, fitted: Fitted, fit_s: float) -> Rival:
-    """Score a fit as the ladder scores its steps."""
-    numbers = len({number.label for number in fitted.free if number.effect})
-    return Rival(name, numbers, hold_out(data, fitted), fit_s)
 
 
 def hold_contest(data: EstimationData, rivals: Sequence[Rival]) -> Contest:

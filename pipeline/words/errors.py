@@ -69,8 +69,6 @@ _WHOLE = 1.005
 _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Smallest unused share of a drive that is reported: in uniform driving it can be a fifth.
 _LEAST_SHOWN = 0.25
-_MATTERS = 2.0
-"""Least factor of an input over all others at which it is said."""
 _SPANS = 3
 """Number of spans in a sentence."""
 _UNITS = {"x": "m/s", "y": "m/s", "w": "rad/s"}

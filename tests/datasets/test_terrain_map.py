@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from simulated_platforms import PLATFORMS
+from simulated_platforms import ORIGIN_DEG, PLATFORMS
 from verbs import run_verb
 
 from pipeline.analysis import Options
@@ -15,7 +15,6 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.terrain_map import Beside, draw_up_terrain, locate_on_earth, read_beside
 from pipeline.simulate import Ground, Program, Recording, Scenario, simulate_run, write_log
 from pipeline.simulate.path import CompactedGround
-from pipeline.simulate.sensors import ORIGIN_DEG
 from pipeline.stages.satellite import from_local_plane, to_local_plane
 from pipeline.store import Store
 
