@@ -1,4 +1,4 @@
-"""Shared by verbs that work on models: runs, trusted model files, few-shot fits, models of the literature."""
+"""Shared by verbs that work on models: runs, model files, few-shot fits, models of the literature."""
 
 from __future__ import annotations
 

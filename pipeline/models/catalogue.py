@@ -11,7 +11,8 @@ import inspect
 import pkgutil
 import re
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import metadata, resources
 from pathlib import Path
 from types import ModuleType
@@ -57,12 +58,12 @@ def find_effect(name: str) -> EffectClass:
         MotionError: ``unknown_effect``, with the nearest ids.
     """
     known = {effect.id: effect for effect in list_effects()}
-    found = known.get(name) or list_own_effects().get(name)
-    if found is None:
+    effect = known.get(name) or list_own_effects().get(name)
+    if effect is None:
         near = guess_names(name, known)
         hint = f"{near}`slip effects` lists them all; --effects FILE.py loads one of your own."
         raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
-    return found
+    return effect
 
 
 def name_effect(effect: str) -> str:
@@ -128,13 +129,20 @@ def load_effects(paths: Iterable[Path]) -> None:
         module = ModuleType(f"slip_effects_{hashlib.sha256(code).hexdigest()}")
         module.__file__ = str(path)
         sys.modules[module.__name__] = module
-        try:
+        with _naming_errors(str(path)):
             exec(compile(code, str(path), "exec", dont_inherit=True), vars(module))  # noqa: S102 - the user's own
-        except Exception as error:
-            what = f"the file of effects does not run: {type(error).__name__}: {' '.join(str(error).split())}"
-            hint = "Correct it; it must be importable Python."
-            raise MotionError("effects_file", what, where=str(path), hint=hint) from error
         _own.update(_check_own(_effects_of(module), str(path)))
+
+
+@contextmanager
+def _naming_errors(where: str) -> Iterator[None]:
+    """Raise whatever the user's own Python raises as one line that says where."""
+    try:
+        yield
+    except Exception as error:
+        what = f"the effects cannot be loaded: {type(error).__name__}: {' '.join(str(error).split())}"
+        hint = "Correct it; it must be importable Python."
+        raise MotionError("effects_file", what, where=where, hint=hint) from error
 
 
 def list_own_effects() -> dict[str, EffectClass]:
@@ -146,16 +154,17 @@ def list_own_effects() -> dict[str, EffectClass]:
 def _list_installed() -> dict[str, EffectClass]:
     effects: dict[str, EffectClass] = {}
     for entry in metadata.entry_points(group=_GROUP):
-        loaded = entry.load()
-        found = _effects_of(loaded) if inspect.ismodule(loaded) else [loaded]
-        effects |= _check_own(found, f"{_GROUP}: {entry.name}")
+        with _naming_errors(f"{_GROUP}: {entry.name}"):
+            loaded = entry.load()
+        classes = _effects_of(loaded) if inspect.ismodule(loaded) else [loaded]
+        effects |= _check_own(classes, f"{_GROUP}: {entry.name}")
     return effects
 
 
 def _check_own(effects: list[EffectClass], where: str) -> dict[str, EffectClass]:
     if not effects:
         hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
-        raise MotionError("effects_file", "the file defines no effect", where=where, hint=hint)
+        raise MotionError("effects_file", "it defines no effect", where=where, hint=hint)
     for effect in effects:
         if any(known.id == effect.id for known in list_effects()):
             what, hint = f"an effect of the catalogue is called {effect.id!r}", "Choose another id."

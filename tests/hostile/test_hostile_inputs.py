@@ -69,7 +69,7 @@ WORDS: list[tuple[str, str]] = [
     ("model new-effect drive_lag.py", "an effect is called so already"),
     ("model add missing.toml drive_lag --on field/wide", "missing.toml"),
     ("model add husky.toml mine --on field/wide --effects gone.py", "gone.py: cannot be read"),
-    ("model show husky.toml --effects text.mcap", "text.mcap: the file of effects does not run"),
+    ("model show husky.toml --effects text.mcap", "text.mcap: the effects cannot be loaded"),
     ("model add husky.toml nothing --on field/wide", "no effect is called 'nothing'"),
     ("model add husky.toml effective_track --on text.mcap", "text.mcap"),
     ("model add husky.toml drive_lag --on", "--on names no run"),

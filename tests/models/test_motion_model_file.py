@@ -113,7 +113,7 @@ def test_effects_of_one_s_own_are_known_once_their_file_was_loaded(tmp_path: Pat
     ("text", "says"),
     [
         ("1 / 0", "ZeroDivisionError"),
-        ("x = 1", "defines no effect"),
+        ("x = 1", "it defines no effect"),
         (OWN_EFFECT.replace('"tilt"', '"drive_lag"'), "of the catalogue is called 'drive_lag'"),
     ],
 )

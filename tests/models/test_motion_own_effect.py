@@ -81,6 +81,12 @@ def test_an_installed_package_brings_effects_by_its_entry_points(
     catalogue._list_installed.cache_clear()
     assert list(list_own_effects()) == ["side_wind"]
     assert find_effect("side_wind")(k=0.1).values == {"k": 0.1}
+    broken = metadata.EntryPoint("wind", "no_such_module", "slip.effects")
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [broken] if group == "slip.effects" else [])
+    catalogue._list_installed.cache_clear()
+    with pytest.raises(MotionError, match=r"slip\.effects: wind: the effects cannot be loaded: Module"):
+        find_effect("side_wind")
+    assert find_effect("drive_lag")
     catalogue._list_installed.cache_clear()
 
 
