@@ -92,7 +92,8 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    models.load_effects(effects or ())
+    if effects:
+        models.load_effects(effects)
     options = build_options(choices)
     options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
     outcomes: list[Outcome] = []

@@ -15,6 +15,8 @@ from pipeline.models import catalogue, find_effect, list_own_effects, load_effec
 from pipeline.models.effect import Effect
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
+from pipeline.sources import find_preset
+from pipeline.web.session import list_catalogue
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "pages").rglob("*.md"))
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -62,6 +64,15 @@ def test_a_model_file_never_names_code(place: Path) -> None:
         assert "--effects FILE.py" in line
     assert "unknown key 'effects'" in run_verb("model", "show", "n.toml").stderr
     assert not (place / "ran").exists()
+
+
+def test_the_workbench_offers_an_effect_that_was_loaded(place: Path) -> None:
+    assert run_verb("model", "new-effect", "side_wind.py").returncode == 0
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    assert "side_wind" not in {one["id"] for one in list_catalogue(vehicle)}
+    load_effects([place / "side_wind.py"])
+    assert "side_wind" in {one["id"] for one in list_catalogue(vehicle)}
 
 
 def test_a_file_that_is_not_there_is_named(place: Path) -> None:
