@@ -7,20 +7,22 @@ the change is undone, the medians stay the same), `WRONG` otherwise.
 
 import argparse
 import re
+import sys
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 from measuring import RECORDINGS
 from rewritten_logs import Change, Roles, list_changes, read, write
+from simulated_platforms import PLATFORMS, simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.recording.log_setup import set_up_log
-from pipeline.simulate import PLATFORMS, simulate_case
 
 SAMPLES = Path(__file__).parents[1] / "data_samples"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
@@ -99,7 +101,7 @@ def list_logs(folder: Path, which: str) -> list[Path]:
         logs = [path for path in RECORDINGS.glob("*.mcap") if not path.stem.startswith(STANDING)]
         return sorted(logs, key=lambda path: path.stat().st_size)
     for name in PLATFORMS:
-        simulate_case(None, {}, out=folder / f"{name}.mcap", seed=5, duration_s=100.0, platform=name)
+        simulate_platform(name, {}, out=folder / f"{name}.mcap", seed=5, duration_s=100.0)
     return sorted(folder.glob("*.mcap"))
 
 

@@ -20,7 +20,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 MEASURED = ROOT / "benchmarks" / "measured"
 PAGES_FOLDER = ROOT / "docs" / "pages"
-PAGES = sorted(PAGES_FOLDER.rglob("*.md"))
+PAGES = [*sorted(PAGES_FOLDER.rglob("*.md")), ROOT / "benchmarks" / "rivals.md"]
 BLOCK = re.compile(r"(<!-- measured: (?P<name>[^>]*?) -->\n)(?P<text>.*?)(<!-- /measured -->)", re.DOTALL)
 ALLOWED_VERSIONS = 1
 """Versions by which a table may be older than the program: a mend does not ask for hours of measurement."""

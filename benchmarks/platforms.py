@@ -4,13 +4,16 @@ Every platform's log is simulated with hidden effects and handed to `slip diagno
 """
 
 import argparse
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
+from simulated_platforms import PLATFORMS, Platform, simulate_platform
+
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.simulate import PLATFORMS, Platform, simulate_case
 
 CAR = {"steering_offset": 0.05, "drive_lag": 0.3}
 SIDES = {"effective_track": 1.5, "drive_lag": 0.3}
@@ -45,9 +48,7 @@ def hidden_effects(platform: Platform) -> dict[str, float]:
 def try_platform(name: str, folder: Path, *, duration_s: float = 180.0, seed: int = 3) -> Row:
     platform = PLATFORMS[name]
     hidden = hidden_effects(platform)
-    log = simulate_case(
-        None, hidden, out=folder / f"{name}.mcap", seed=seed, duration_s=duration_s, platform=name
-    )
+    log = simulate_platform(name, hidden, out=folder / f"{name}.mcap", seed=seed, duration_s=duration_s)
     options = Options(out=folder / "results", report=False, diagnosis=True)
     summary = analyze_log(log, options).summary
     topics, diagnosis = summary["topics"], summary["diagnosis"]

@@ -7,8 +7,7 @@ says so.
 Every model is judged on each recording three times, on the same predictions over 2 s: fitted to the run and
 held out in it by stretches of ten seconds; fitted to another run on the same ground; fitted to a run on
 another ground. Of the latter two only clocks are fitted here. A learned model adds to the ideal one;
-`named + trees` adds boosted trees to the named physics, `named + learned` a learned term where that helps on
-what it was fitted to: held out in the run, that choice is held out, too. Which effects are named was decided
+`named + trees` adds boosted trees to the named physics. Which effects are named was decided
 on the whole run: held out in the run, only their numbers are unseen. Of each model the band is told too that
 held 95 % of its held-out errors of position where it was fitted, and the share of errors here that it holds.
 """
@@ -26,6 +25,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from learners import Learned, Lesson, list_learners, score_learned
 from measured_tables import render_section
 from measuring import RECORDINGS, add_row, read_rows
 from threadpoolctl import threadpool_limits
@@ -35,17 +35,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
 from pipeline.estimation import EstimationData, Fitted, HeldOut, Input, hold_out
-from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
-from pipeline.estimation.rivals import (
-    Contest,
-    Learned,
-    Lesson,
-    Rival,
-    hold_contest,
-    list_learners,
-    score_learned,
-    time_fit,
-)
+from pipeline.estimation.rivals import Contest, Rival, hold_contest, time_fit
 from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import Model
@@ -57,7 +47,6 @@ from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Manifest, Store
 
 NAMED, IDEAL, TREES, BEYOND = "named physics", "ideal", "learned_trees", "named + trees"
-KEPT = "named + learned"
 PLACES = ("in the run", "same ground", "other ground")
 METRICS = ("t_mrmse_m", "r_mrmse_rad")
 BAND = 0.95
@@ -118,7 +107,6 @@ class Recording:
             fitted, fit_s = time_fit(self.data, model)
             numbers = len({number.label for number in fitted.free if number.effect})
             found[name] = Entry(Rival(name, numbers, hold_out(self.data, fitted), fit_s), fitted)
-        found[KEPT] = self._keep_term(found[NAMED])
         if not self._learns:
             return found
         for learner in list_learners():
@@ -127,15 +115,6 @@ class Recording:
             if learner.name == TREES:
                 found[BEYOND] = self._learn(BEYOND, found[NAMED].fitted, lesson)
         return found
-
-    def _keep_term(self, named: Entry) -> Entry:
-        """The named physics with a learned term where that helps."""
-        begun = time.process_time()
-        rung = make_learned_step(self.data, named.fitted, named.rival.held_out)
-        fitted = named.fitted if rung.refusal else add_term(named.fitted, rung.term)
-        fit_s = named.rival.fit_s + time.process_time() - begun
-        held_out = hold_out(self.data, named.fitted, learn_where_it_helps(self.data))
-        return Entry(Rival(KEPT, None, held_out, fit_s), fitted)
 
     def _learn(self, name: str, fitted: Fitted, lesson: Lesson) -> Entry:
         begun = time.process_time()
@@ -238,9 +217,9 @@ def find_best(models: Judged, names: Iterable[str], metric: str) -> str:
 
 def list_groups(models: Judged) -> dict[str, list[str]]:
     learned = [name for name in models if name.startswith("learned_")]
-    literature = [name for name in models if name not in {NAMED, BEYOND, KEPT, *learned}]
-    beyond = {name: [name] if name in models else [] for name in (BEYOND, KEPT)}
-    return {"literature": literature, "learned": learned, **beyond}
+    literature = [name for name in models if name not in {NAMED, BEYOND, *learned}]
+    beyond = [BEYOND] if BEYOND in models else []
+    return {"literature": literature, "learned": learned, BEYOND: beyond}
 
 
 def describe_sections(rows: Sequence[Row]) -> list[dict[str, object]]:
@@ -249,7 +228,7 @@ def describe_sections(rows: Sequence[Row]) -> list[dict[str, object]]:
     for place in PLACES:
         here = [row for row in rows if row["place"] == place]
         for metric, words in zip(METRICS, ("position", "heading"), strict=True) if here else ():
-            head = ["recording", "from", IDEAL, NAMED, "best of the literature", "best learned", BEYOND, KEPT]
+            head = ["recording", "from", IDEAL, NAMED, "best of the literature", "best learned", BEYOND]
             cells = [list_cells(row, metric) for row in here]
             sections.append(
                 {"place": place, "metric": words, "head": head, "rows": cells, **summarize(here, metric)}
@@ -287,7 +266,7 @@ def list_cells(row: Row, metric: str) -> list[str]:
     for names in list_groups(models).values():
         if names:
             best = find_best(models, names, metric)
-            label = "" if best in {BEYOND, KEPT} else f"{best} "
+            label = "" if best == BEYOND else f"{best} "
             cells.append(f"{label}{show(models, best, metric)} {mark(models, best, metric)}")
         else:
             cells.append("")
@@ -310,11 +289,11 @@ def summarize(rows: Sequence[Row], metric: str) -> dict[str, object]:
         name: np.median(
             [1.0 - read_error(one, name, metric) / read_error(one, IDEAL, metric) for one in judged]
         )
-        for name in (NAMED, BEYOND, KEPT)
+        for name in (NAMED, BEYOND)
         if all(name in one for one in judged)
     }
     bands = {}
-    for name in (NAMED, TREES, BEYOND, KEPT) if metric == METRICS[0] else ():
+    for name in (NAMED, TREES, BEYOND) if metric == METRICS[0] else ():
         held = [one[name]["band_holds"] for one in judged if name in one]
         shares = [round(share, 4) for share in held if isinstance(share, float)]
         if shares:

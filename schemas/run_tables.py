@@ -119,22 +119,6 @@ class Imu(Table):
     active = schemas.flag("inside an interval in which commands are live")
 
 
-class Power(Table):
-    """One row a message of the first current, what else is recorded at its times."""
-
-    VERSION: ClassVar[int] = 1
-
-    t = schemas.seconds()
-    stamp = schemas.stamp()
-    log_time = schemas.log_time()
-    current = schemas.number("A", "current that the drive draws, all its motors; below zero it feeds back")
-    voltage = schemas.optional("V", "voltage of the battery")
-    power = schemas.optional("W", "current times voltage")
-    energy_per_m = schemas.optional(
-        "J/m", "power over the speed over ground within 0.5 s before and after; null below 0.1 m/s"
-    )
-
-
 class Alignments(Table):
     """One row a run."""
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from game.closed_loop import close_loop
 from game.odd import DRAWN, ODD
+from game.rigid_bodies import MACHINES, SkidSteer, simulate_skid_steer
 from game.sizes import draw_size
 from pipeline.simulate import (
     LAYOUTS,
-    MACHINES,
     SLOPE_EFFECTS,
     VEHICLES,
     Disturbance,
@@ -31,10 +31,8 @@ from pipeline.simulate import (
     Program,
     Recording,
     Scenario,
-    SkidSteer,
     list_effects,
     simulate_run,
-    simulate_skid_steer,
     write_log,
 )
 

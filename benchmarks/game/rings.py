@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from game.draw import Answer, Category, Riddle, draw_riddle
 from game.held_out import HORIZON_S, HeldOut, cut_windows
 from game.odd import ODD
+from game.rigid_bodies import simulate_skid_steer
 from game.score import TRUTH_FORMAT
 from pipeline.simulate import (
     LAYOUTS,
@@ -44,7 +45,6 @@ from pipeline.simulate import (
     SimulatedRun,
     list_effects,
     simulate_run,
-    simulate_skid_steer,
     write_log,
 )
 from pipeline.simulate.scenario import Commands

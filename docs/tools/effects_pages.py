@@ -149,7 +149,7 @@ def list_settings(kind: type[Effect]) -> list[tuple[str, list[str]]]:
     vehicle, effect = _vehicle_of(kind), _usual(kind)
     found = []
     for target in list_targets():
-        if target.name in {"json", "python", "traction", "nav2_traction"}:
+        if target.name in {"json", "python"}:
             continue
         try:
             with_it = _read_settings(Model(vehicle, (effect,)), target.name, target.corrects)

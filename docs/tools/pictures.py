@@ -84,7 +84,7 @@ def draw_pictures(folder: Path) -> list[Path]:
 def _draw_terrain(chrome: Chrome, work: Path, picture: Path) -> None:
     """The map of what to expect, of the drive that its page of the handbook simulates."""
     results, log = work / "terrain", work / "laps" / "morning.mcap"
-    simulate = [SLIP, "simulate", "husky_laps_on_snow", "--platform", "panther", "--seed", "1", "--file", log]
+    simulate = [SLIP, "simulate", "husky_laps_on_snow", "--seed", "1", "--file", log]
     quick = ["--no-report", "--no-diagnosis", "--quiet", "--results", results]
     for words in (
         simulate,

@@ -1,6 +1,7 @@
 """Execution of the stages of one run, and slip relative to a model."""
 
 import hashlib
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -42,7 +43,7 @@ from schemas import contract_of
 
 
 def hash_model(path: Path | None) -> str | None:
-    """Hash of a model file's bytes and of the Python code it uses; None without a model.
+    """Hash of a model file's bytes and of the user's own Python of its effects; None without a model.
 
     Raises:
         MotionError: the file cannot be read, or the model file is wrong.
@@ -54,9 +55,12 @@ def hash_model(path: Path | None) -> str | None:
         MotionError, "model_not_found", "the model file cannot be read", where=path, hint=hint
     ):
         content = read_bounded(path)
-    from pipeline.models import read_model  # noqa: PLC0415 - heavy
+    from pipeline.models import is_own, read_model  # noqa: PLC0415 - heavy
 
-    return hashlib.sha256(content + "".join(read_model(path).code).encode()).hexdigest()
+    own = {inspect.getfile(type(effect)) for effect in read_model(path).model if is_own(type(effect))}
+    return hashlib.sha256(
+        b"".join([content, *(read_bounded(Path(file)) for file in sorted(own))])
+    ).hexdigest()
 
 
 # Stages of one run: each reads the tables of the previous one and writes its own.
@@ -382,7 +386,7 @@ def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
 VERSIONS: Mapping[str, int] = {"extract": 21, "velocity": 7, "slip": 22, "aggregate": 4}
 
 
-EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
+EXTRACTED = ("commands", "wheels", "poses", "imu")
 
 
 TABLES: Mapping[str, tuple[str, ...]] = {

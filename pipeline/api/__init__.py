@@ -21,6 +21,7 @@ from pipeline.api.fitted_model import (
     Model,
     StoredRun,
     effect,
+    load_effects,
     tabulate_ladder,
     tabulate_parameters,
     take_file,
@@ -29,7 +30,6 @@ from pipeline.api.fitted_model import (
 from pipeline.batch.recordings import list_named
 from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
 from pipeline.datasets import (
-    Against,
     Baseline,
     check_as_json,
     check_runs,
@@ -245,15 +245,13 @@ class Run(StoredRun):
         self,
         models: Mapping[str, Model] | None = None,
         *,
-        against: Sequence[Against] = ("literature",),
         input: Literal["command", "measured"] | None = None,
         vehicle_of: Owner | None = None,
     ) -> pl.DataFrame:
-        """Fit models to the run: held-out errors side by side, as `slip model compare --against` prints them.
+        """Fit models and those of the literature to the run, and score them on data not seen.
 
         Args:
             models: models of one's own by name.
-            against: `literature`, or `learned`, which needs the extra of that name, or both.
             input: what they are fed with; None as at the models' last fit, else as their effects need it.
             vehicle_of: whose geometry counts where the run is of another vehicle than the models.
 
@@ -265,7 +263,7 @@ class Run(StoredRun):
         known = next((file.model.vehicle for file in files.values()), None)
         vehicle, runs = read_runs([self.manifest], known, vehicle_of)
         with threadpool_limits(1):
-            contest = contest_models(files, runs, vehicle, against, input).contest
+            contest = contest_models(files, runs, vehicle, input).contest
         return pl.DataFrame(
             [
                 {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
@@ -30,6 +29,7 @@ from pipeline.models import (
     Effect,
     FormulaEffect,
     ModelFile,
+    catalogue,
     find_effect,
     make_parameter,
     read_model,
@@ -133,6 +133,15 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     return FormulaEffect(name, texts, tuple(parameters))
 
 
+def load_effects(path: str | Path) -> None:
+    """Run a Python file with effects of your own, which `effect` finds and model files may name from now on.
+
+    Args:
+        path: the file, as `slip model new-effect` writes one.
+    """
+    catalogue.load_effects([Path(path)])
+
+
 class StoredRun:
     """The tables of an analyzed run.
 
@@ -183,11 +192,8 @@ class Model:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a model file; Python that it names runs only where it was trusted, else a warning says so."""
-        file = read_model(Path(path))
-        for text in file.warnings:
-            warnings.warn(text, stacklevel=2)
-        return cls.of(file)
+        """Read a model file; effects of your own are loaded before, with `load_effects`."""
+        return cls.of(read_model(Path(path)))
 
     def write(self, path: str | Path) -> None:
         """Write it as a model file."""
@@ -375,10 +381,9 @@ class Model:
         """Its values as parameters of what people run, as `slip model export` writes them.
 
         Args:
-            to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, simulator,
-                json or python.
-            current: for vesc and px4 the robot's file of parameters, which is corrected; for simulator the
-                simulator's own export.
+            to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or
+                python.
+            current: for vesc and px4 the robot's file of parameters, which is corrected.
             gate: for autoware whether the steering offset is applied: off, on, or on and learned on.
         """
         return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)

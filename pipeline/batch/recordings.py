@@ -18,7 +18,6 @@ from pipeline.batch import BatchError
 from pipeline.core import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 from pipeline.logs.index import LISTING, are_separate, split_number
-from pipeline.logs.other_formats import recognize_text_folder
 
 # Reading of arbitrary folders: link cycles, dead mounts, folders without permission.
 #
@@ -345,8 +344,7 @@ def _list_recordings(folder: Folder, looker: Looker) -> Iterator[Path]:
     if len(parts) > 1 and not is_listed:
         files = sorted((folder.files[name] for name in parts), key=split_number)
         parts = set() if looker.ask(folder.path, partial(are_separate, files)) else parts
-    tables = None if logs else looker.ask(folder.path, partial(recognize_text_folder, folder.path))
-    if parts or tables is not None:
+    if parts:
         yield folder.path
     yield from (folder.files[name] for name in logs if name not in parts)
 

@@ -389,9 +389,9 @@ def format_vehicle_source(source: str) -> str:
     return "geometry: estimated" if source == "fitted" else f"geometry: from {words}"
 
 
-TrustCode = Annotated[
-    bool,
-    Parameter(name="--trust-code", help="trust the Python that the model file names, now and later"),
+OwnEffects = Annotated[
+    list[Path] | None,
+    Parameter(name="--effects", help="Python file with effects of your own, which is run; may be repeated"),
 ]
 
 

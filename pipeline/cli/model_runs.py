@@ -1,4 +1,4 @@
-"""Shared by verbs that work on models: runs, trusted model files, few-shot fits, models of the literature."""
+"""Shared by verbs that work on models: runs, model files, few-shot fits, models of the literature."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pipeline import datasets, models, sources
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
+    OwnEffects,
     Results,
-    TrustCode,
     open_shown,
     print_json,
     print_lines,
@@ -32,53 +32,14 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest
 
 
-def trust_named(path: Path | None, *, wanted: bool) -> None:
-    """Trust the Python that a model file names, if that is wanted.
+def open_model(path: Path, effects: Sequence[Path] | None) -> models.ModelFile:
+    """Read a model file, with the user's own effects that are in the given Python files.
 
     Raises:
-        MotionError: a file is missing, or the list of what is trusted cannot be written.
+        MotionError: a file is wrong, or the model has an effect that is not known.
     """
-    if path is None or not wanted:
-        return
-    models.trust(models.list_code(path))
-
-
-def open_model(path: Path, *, trust_code: bool) -> models.ModelFile:
-    """Read a model file, and say on the screen what of it is left out.
-
-    Raises:
-        MotionError: the file is wrong.
-    """
-    trust_named(path, wanted=trust_code)
-    file = models.read_model(path)
-    print_warnings(file.warnings)
-    return file
-
-
-def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -> models.ModelFile:
-    """Read a model file that is to be written again, and say what of it is left out, once.
-
-    Args:
-        path: the file.
-        trust_code: whether to trust the Python that it names.
-        names: ids of effects that are to be added.
-
-    Raises:
-        MotionError: the file is wrong, effects of it would be lost, or Python that is not trusted may define
-            one of the names.
-    """
-    from pipeline.run import MotionError  # noqa: PLC0415
-
-    trust_named(path, wanted=trust_code)
-    file = models.read_model(path)
-    models.format_model(file)
-    known = {*file.own, *(effect.id for effect in models.list_effects())}
-    if file.warnings and (unknown := [name for name in names if name not in known]):
-        what = f"{', '.join(unknown)} can only come from Python that is not trusted, and that is not run"
-        hint = f"Read it, then trust it: slip model trust {shlex.quote(str(path))}"
-        raise MotionError("untrusted_effect", what, where=str(path), hint=hint)
-    print_warnings(file.warnings)
-    return file
+    models.load_effects(effects or ())
+    return models.read_model(path)
 
 
 def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> int:
@@ -99,67 +60,15 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
         raise MotionError("effect_exists", what, where=str(file), hint=hint)
     models.write_text(file, text, code="effect_unwritable")
     if not quiet:
-        where, model = shlex.quote(str(file)), shlex.quote(str(file.with_name("robot.toml")))
+        own, model = shlex.quote(str(file)), shlex.quote(str(file.with_name("robot.toml")))
         print_lines(
             [
                 f"{file}: the effect {file.stem}; change its formula, its parameters and its test",
-                f"next      slip model new {model} --vehicle husky_a200 --own {where}",
-                f"next      slip model trust {model}",
-                f"next      slip model add {model} {file.stem} --on run.mcap",
+                f"next      slip model new {model} --vehicle husky_a200",
+                f"next      slip model add {model} {file.stem} --effects {own} --on run.mcap",
             ]
         )
     return CLEAN
-
-
-def trust(files: list[Path], /, *, json: bool = False) -> int:
-    """Trust the Python that model files name, by its content.
-
-    It is run from now on, whatever its path. Read it first: it runs with all your rights. A changed file must
-    be trusted anew.
-
-    Args:
-        files: model files, or Python files.
-        json: print one JSON object.
-    """
-    hashes = {code: name for path in files for code, name in models.list_code(path).items()}
-    models.trust(hashes)
-    return _print(hashes, "names no Python", json=json)
-
-
-def untrust(codes: list[str], /, *, json: bool = False) -> int:
-    """Withdraw the trust in Python files.
-
-    Args:
-        codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
-        json: print one JSON object.
-    """
-    gone: dict[str, str] = {}
-    known = models.list_trusted()
-    for word in codes:
-        meant = (
-            models.list_code(Path(word))
-            if Path(word).exists()
-            else [code for code in known if code.startswith(word)]
-        )
-        gone |= {code: known[code] for code in meant if code in known}
-    models.distrust(set(gone))
-    return _print(gone, "none of it was trusted", json=json)
-
-
-def trusted(*, json: bool = False) -> int:
-    """List the Python that is trusted.
-
-    Args:
-        json: print one JSON object.
-    """
-    return _print(models.list_trusted(), "no Python is trusted", json=json)
-
-
-def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
-    content = {"code": [{"sha256": code, "name": name} for code, name in codes.items()]}
-    return print_result(
-        content, lambda: [f"{code}  {name}" for code, name in codes.items()] or [otherwise], json=json
-    )
 
 
 def gather_runs(
@@ -346,10 +255,8 @@ def tie_to_fleet(data: EstimationData, model: models.Model, out: Path) -> Estima
     Raises:
         SlipError: see `forecast_runs`.
     """
-    from pipeline.estimation.across_runs import tie_to_prior  # noqa: PLC0415 - heavy
-
     forecast = forecast_runs(data.runs, model.vehicle, data.source.value, out)
-    return tie_to_prior(data, forecast.prior)
+    return data.with_prior(forecast.prior)
 
 
 def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:
@@ -364,13 +271,7 @@ def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:
     return values
 
 
-Against = Annotated[
-    list[Literal["literature", "learned"]] | None,
-    Parameter(
-        help="compare with models of the literature, or with learned ones (the extra learn)",
-        consume_multiple=True,
-    ),
-]
+Against = Annotated[Literal["literature"] | None, Parameter(help="compare with models of the literature")]
 
 
 def literature(name: str | None = None, /, *, json: bool = False) -> int:
@@ -383,8 +284,9 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
         json: print one JSON object.
     """
     if name is None:
-        rows = [_list_model(model) for model in models.MODELS]
-        return print_result({"models": [_as_json(model) for model in models.MODELS]}, lambda: rows, json=json)
+        every = models.list_literature()
+        content = {"models": [_as_json(model) for model in every]}
+        return print_result(content, lambda: [_list_model(model) for model in every], json=json)
     model = models.find_model(name)
     return print_result(_as_json(model), lambda: _format_model(model), json=json)
 
@@ -421,25 +323,21 @@ def _format_model(model: models.LiteratureModel) -> list[str]:
     return [*lines, f"source    {source}"]
 
 
-def compare_rivals(
-    files: Mapping[str, models.ModelFile], spoken: On, against: list[Literal["literature", "learned"]]
-) -> int:
-    """Fit models, those of the literature and learned ones to runs, and print their held-out errors.
+def compare_rivals(files: Mapping[str, models.ModelFile], spoken: On) -> int:
+    """Fit models and those of the literature to runs, and print their held-out errors.
 
     Args:
         files: models by the name of their file; may be empty.
         spoken: the runs, and how the answer is printed.
-        against: what they are compared with.
     """
     from pipeline.words import format_contest  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)
     vehicle, runs = gather_runs(spoken.on, known, spoken.vehicle_of, spoken.results, quiet=quiet)
-    contest = datasets.contest_models(files, runs, vehicle, against, spoken.input)
-    warnings = [text for file in files.values() for text in file.warnings]
-    warnings += [contest.chosen.warning] if contest.chosen.warning else []
-    if "literature" in against and len(models.list_models(vehicle)) == 1:
+    contest = datasets.contest_models(files, runs, vehicle, spoken.input)
+    warnings = [contest.chosen.warning] if contest.chosen.warning else []
+    if len(models.list_models(vehicle)) == 1:
         warnings.append(
             f"no model of the literature but the ideal one describes a {vehicle.kind} vehicle: "
             "`slip model literature` lists each model with its vehicles"
@@ -472,7 +370,7 @@ class On:
         Parameter(help="geometry to use where the run is of another vehicle (default: refuse)"),
     ] = None
     results: Results = Path("results")
-    trust_code: TrustCode = False
+    effects: OwnEffects = None
     json: Annotated[bool, Parameter(help="print one JSON object")] = False
     quiet: Annotated[bool, Parameter(help="print no progress and no table")] = False
 

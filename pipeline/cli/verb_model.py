@@ -13,8 +13,8 @@ from cyclopts import App, Parameter
 from pipeline import datasets, models, words
 from pipeline.cli.conventions import (
     CLEAN,
+    OwnEffects,
     Results,
-    TrustCode,
     print_json,
     print_lines,
     print_result,
@@ -32,21 +32,16 @@ from pipeline.cli.model_runs import (
     literature,
     new_effect,
     open_model,
-    open_to_change,
     prior_as_json,
     read_metres,
     read_seconds,
     require_model,
     require_models,
     tie_to_fleet,
-    trust,
-    trusted,
-    untrust,
 )
 from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.transfer import Transfer
     from pipeline.run import MotionRun
 
@@ -54,22 +49,19 @@ if TYPE_CHECKING:
 def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (
-        new, new_effect, literature, show, add, fit, compare, speed, export, trust, untrust, trusted,
-    ):  # fmt: skip
+    for command in (new, new_effect, literature, show, add, fit, compare, speed, export):
         model.command(command)
     model.command(drop, name=("drop", "remove"))
     return model
 
 
-def new(
+def new(  # noqa: D417 - the shared option documents itself
     model: Path,
     /,
-    *,
+    *ids: str,
     vehicle: str,
-    effects: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     template: Annotated[str | None, Parameter(name="--from")] = None,
-    own: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
+    effects: OwnEffects = None,
     force: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -77,10 +69,9 @@ def new(
 
     Args:
         model: the file to make.
+        ids: ids of effects to begin with, at neutral values, as `slip effects` lists them.
         vehicle: vehicle preset, for example husky_a200.
-        effects: effects to begin with, at neutral values.
         template: a model of the literature to begin with, as `slip model literature` lists them.
-        own: Python files beside the model with effects of your own, as `slip model new-effect` writes them.
         force: replace a file that is there.
         quiet: print nothing.
     """
@@ -93,37 +84,34 @@ def new(
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
     made = models.find_model(template or "ideal").make(chosen)
-    for name in effects or ():
+    models.load_effects(effects or ())
+    for name in ids:
         made = made + models.find_effect(name)()
-    files = tuple(path.name for path in own or ())
-    for name in files:
-        models.read_code(model.parent, name)
-    models.write_model(models.ModelFile(made, effect_files=files), model)
+    models.write_model(models.ModelFile(made), model)
     if not quiet:
         print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}", *_list_idle(made)])
     return CLEAN
 
 
-def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -> int:
+def show(  # noqa: D417 - the shared option documents itself
+    model: Path, /, *, effects: OwnEffects = None, json: bool = False
+) -> int:
     """Show a model: its effects, values, intervals and runs.
 
     Args:
         model: the model file.
-        trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
     from pipeline.estimation.estimates import list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export import export_model  # noqa: PLC0415
 
-    file = open_model(model, trust_code=trust_code)
+    file = open_model(model, effects)
     if json:
         sys.stdout.write(export_model(file, "json"))
         return CLEAN
     parameters = words.format_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     lines += _list_idle(file.model)
-    term = models.find_learned(file.model)
-    lines += [] if term is None else models.describe_learned(term)
     if runs := file.list_fitted("runs"):
         source = str(file.fit.get("input"))
         names = ", ".join(str(run.get("run")) for run in runs)
@@ -134,7 +122,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
 
 
 def add(  # noqa: D417 - the shared options document themselves
-    model: Path, /, *effects: str, spoken: Spoken, anyway: bool = False
+    model: Path, /, *ids: str, spoken: Spoken, anyway: bool = False
 ) -> int:
     """Add effects to a model, fit it, and show what they bring.
 
@@ -144,28 +132,28 @@ def add(  # noqa: D417 - the shared options document themselves
 
     Args:
         model: the model file.
-        effects: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
+        ids: ids of effects, as `slip effects` lists them.
         anyway: add the effects even if the data do not support them.
     """
-    file = open_to_change(model, trust_code=spoken.trust_code, names=effects)
+    file = open_model(model, spoken.effects)
     changed = file.model
-    for name in effects:
-        changed = changed + models.find_effect(name, file.own)()
+    for name in ids:
+        changed = changed + models.find_effect(name)()
     return _change(model, file, replace(file, model=changed), spoken, must_help=not anyway)
 
 
 def drop(  # noqa: D417 - the shared options document themselves
-    model: Path, /, *effects: str, spoken: Spoken
+    model: Path, /, *ids: str, spoken: Spoken
 ) -> int:
     """Drop effects from a model, and fit the rest.
 
     Args:
         model: the model file.
-        effects: ids of effects that the model has.
+        ids: ids of effects that the model has.
     """
-    file = open_to_change(model, trust_code=spoken.trust_code)
+    file = open_model(model, spoken.effects)
     changed = file.model
-    for name in effects:
+    for name in ids:
         changed = changed - name
     return _change(model, file, replace(file, model=changed), spoken)
 
@@ -194,10 +182,11 @@ def fit(  # noqa: D417 - the shared options document themselves
     """
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
+        models.load_effects(spoken.effects or ())
         quiet = spoken.quiet or spoken.json
         file = expect_model(spoken.on, spoken.input, spoken.results, quiet=quiet)
     else:
-        file = open_to_change(require_model(model), trust_code=spoken.trust_code)
+        file = open_model(require_model(model), spoken.effects)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
@@ -211,37 +200,32 @@ def compare(  # noqa: D417 - the shared options document themselves
     """Compare two models, with their present values, on runs.
 
     A fit of each to the runs is shown as well. With --against, the given models
-    and models of the literature, or learned ones, are fitted to the runs, and their held-out errors compared.
+    and models of the literature are fitted to the runs, and their held-out errors compared.
 
     Args:
         model: a model file; with --against it may be left out.
         other: another one.
     """
-    from pipeline.estimation.across_runs import describe_coverage  # noqa: PLC0415
-    from pipeline.estimation.learned_step import check_bands  # noqa: PLC0415
     from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
 
     paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
     if against is None:
         require_models(model, other)
-    opened = [open_model(path, trust_code=spoken.trust_code) for path in paths]
+    opened = [open_model(path, spoken.effects) for path in paths]
     if against is not None:
-        return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken, against)
-    omitted = [text for file in opened for text in file.warnings]
+        return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken)
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both models use the same input, so that their errors are comparable.
     last = {file.last_input for file, _ in files}
     effects = [effect for file, _ in files for effect in file.model]
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
-    held: list[dict[str, Coverage]] = []
     own_runs: list[str] = []
     for path, (file, runs) in zip(paths, files, strict=True):
         own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in runs}
         seen = "its error there is not a held-out error"
         own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
-        held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
         carried = carry_over(
             file.model,
             runs,
@@ -256,16 +240,12 @@ def compare(  # noqa: D417 - the shared options document themselves
             {
                 "input": chosen.source.value,
                 "input_reason": chosen.reason,
-                "compared": [
-                    {**_transfer_as_json(name, item), "bands_hold": {k: vars(v) for k, v in one.items()}}
-                    for (name, item), one in zip(rows, held, strict=True)
-                ],
-                "warnings": [*omitted, *warnings],
+                "compared": [_transfer_as_json(name, item) for name, item in rows],
+                "warnings": warnings,
             }
         )
     elif not spoken.quiet:
         print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
-        print_lines([text for one in held for text in describe_coverage(one)])
         print_warnings(warnings)
     return CLEAN
 
@@ -287,7 +267,7 @@ def speed(  # noqa: D417 - the shared options document themselves
     from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415
 
     tolerance_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
-    opened = open_model(model, trust_code=spoken.trust_code)
+    opened = open_model(model, spoken.effects)
     file, runs = _gather(spoken, opened, spoken.on)
     chosen = choose_input(runs, spoken.input, file.model, last=file.last_input)
     limits = limit_speeds(file, runs, chosen.source, tolerance_m, ahead_s)
@@ -297,7 +277,7 @@ def speed(  # noqa: D417 - the shared options document themselves
         "ahead_s": ahead_s,
         "input": chosen.source.value,
         "terrains": limits_as_json(limits),
-        "warnings": [*file.warnings, *warnings],
+        "warnings": warnings,
     }
     if not spoken.json:
         print_warnings(warnings)
@@ -315,10 +295,7 @@ def export(  # noqa: D417 - the options document themselves
     to: str,
     current: Annotated[
         Path | None,
-        Parameter(
-            help="vesc, px4: the robot's file of parameters, which is corrected; "
-            "simulator: the simulator's own export"
-        ),
+        Parameter(help="vesc, px4: the robot's file of parameters, which is corrected"),
     ] = None,
     on: Annotated[
         list[str] | None,
@@ -332,7 +309,7 @@ def export(  # noqa: D417 - the options document themselves
     ] = None,
     results: Results = Path("results"),
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
 ) -> int:
     """Export a model to what people run.
 
@@ -340,13 +317,12 @@ def export(  # noqa: D417 - the options document themselves
 
     Args:
         model: the model file.
-        to: ros2_control, nav2, nav2_amcl, nav2_traction, autoware, vesc, px4, robot_localization, gazebo,
-            simulator, traction, json or python.
+        to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
 
     used = None if current is None else read_current(current, to)
-    opened = open_model(model, trust_code=trust_code)
+    opened = open_model(model, effects)
     text = export_model(judge_measured(opened, to, on, results) if on else opened, to, used, gate)
     if file is None:
         sys.stdout.write(text)
@@ -373,8 +349,6 @@ def _change(
     """
     from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
 
-    # Excluded effects would be lost from the file: raise this error before a long fit.
-    models.format_model(after)
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
     model = after.model
@@ -403,7 +377,7 @@ def _change(
                 **fit.to_json(),
                 "prior": prior_as_json(fit.after.data),
                 "carried_over": [_transfer_as_json(str(path), item) for item in carried],
-                "warnings": [*before.warnings, *warnings],
+                "warnings": warnings,
             }
         )
     elif not spoken.quiet:

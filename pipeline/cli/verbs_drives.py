@@ -325,7 +325,6 @@ def simulate(  # noqa: D417 - arguments document themselves
     vehicle: str | None = None,
     layout: str | None = None,
     program: str | None = None,
-    platform: str | None = None,
     play: Path | None = None,
     cases: Annotated[bool, Parameter(negative=())] = False,
     json: bool = False,
@@ -342,20 +341,17 @@ def simulate(  # noqa: D417 - arguments document themselves
         vehicle: simulated vehicle.
         layout: layout of topics.
         program: how the vehicle is driven.
-        platform: platform that sets vehicle, topics, types and frames (husky_a200, turtlebot4, ...).
         play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
         cases: list the cases and effects instead.
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
+    from pipeline.simulate import list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
     if cases:
-        topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
         lists = {
             "cases": {one.name: one.shows for one in list_cases()},
             "effects": {one.id: one.formula for one in (*list_effects(), *list_written_effects())},
-            "platforms": {name: ", ".join(published) for name, published in topics.items()},
         }
         return print_result(lists, lambda: _format_case(lists), json=json)
     effects = dict(_parse_effect(text) for text in effect or [])
@@ -371,7 +367,6 @@ def simulate(  # noqa: D417 - arguments document themselves
         vehicle=vehicle,
         layout=layout,
         program=program,
-        platform=platform,
         play=play,
         written=() if effects.keys() <= {one.id for one in list_effects()} else list_written_effects(),
     )

@@ -18,8 +18,8 @@ from pipeline.cli.conventions import (
     Choices,
     Limit,
     MemoryLimit,
+    OwnEffects,
     Results,
-    TrustCode,
     build_options,
     exit_code,
     open_shown,
@@ -48,7 +48,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     model: Annotated[
         Path | None, Parameter(help="model that is known: only effects beyond it are estimated")
     ] = None,
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     vehicle_of: Annotated[
         Literal["model", "run"] | None,
         Parameter(help="geometry to use where the run is of another vehicle than --model"),
@@ -65,7 +65,6 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     From one run, or from several of one vehicle jointly: all that are given, or that a folder holds.
 
     Args:
-        trust_code: trust the Python that the model file names, now and later.
         budget: CPU time that a search may take, for example 60s (default: 60s for up to 10 minutes of
             driving, more for longer runs); after it the best answer so far is given.
         everything: show all of the summary: where the error is, budget, limits, causes, ranges between runs.
@@ -74,7 +73,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """
     if apply is not None:
         models.check_target(apply)
-    known = _open_model(model, trust_code=trust_code)
+    models.load_effects(effects or ())
+    known = None if model is None else models.read_model(model)
     budget_s = None if budget is None else estimation.parse_budget(budget)
     diagnosed = Diagnosed(limit)
 
@@ -88,11 +88,11 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     if apply is not None:
         diagnosed.errors += _apply(diagnosed.answers, apply, quiet=quiet or json)
     if json:
-        omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({**diagnosed.to_json(), **omitted})
+        print_json(diagnosed.to_json())
     elif not quiet:
         chosen = {"model": model, "vehicle_of": vehicle_of, "memory": limit.given, "budget": budget}
-        said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
+        said = spell_choices(choices) + spell_flags(chosen)
+        said += "".join(spell_flags({"effects": path}) for path in effects or ())
         print_lines(diagnosed.list_lines(logs, said, apply, everything=everything))
     return diagnosed.end(quiet=quiet)
 
@@ -198,15 +198,6 @@ def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | N
     if suggested := next((one.run for one in runs if one.has_suggestion), None):
         return f"slip serve {shlex.quote(suggested)}    add the suggested term there"
     return applying
-
-
-def _open_model(path: Path | None, *, trust_code: bool) -> models.ModelFile | None:
-    """The named model, if one is named."""
-    if path is None:
-        return None
-    from pipeline.cli.model_runs import open_model  # noqa: PLC0415 - only with a model
-
-    return open_model(path, trust_code=trust_code)
 
 
 def _gather(
@@ -345,6 +336,7 @@ def effects(  # noqa: D417 - the arguments document themselves
     effect: Annotated[str | None, Parameter(help="id of an effect; without one, all are listed")] = None,
     /,
     *,
+    own: OwnEffects = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -358,7 +350,9 @@ def effects(  # noqa: D417 - the arguments document themselves
     """
     from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
 
-    chosen = models.list_effects() if effect is None else (models.find_effect(effect),)
+    models.load_effects(own or ())
+    every = (*models.list_effects(), *models.list_own_effects().values())
+    chosen = every if effect is None else (models.find_effect(effect),)
     pages = models.list_pages(chosen) if effect is None else [format_effect(chosen[0])]
     content = {"effects": [_as_json(item) for item in chosen]}
     return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
@@ -385,6 +379,7 @@ def _as_json(effect: type[models.Effect]) -> dict[str, object]:
 _SUFFIXES = {
     "mcap": "_slip.mcap",
     "csv": "_csv",
+    "parquet": "_parquet",
     "foxglove-layout": "_foxglove.json",
     "plotjuggler-layout": "_plotjuggler.xml",
 }
@@ -394,63 +389,46 @@ def export(  # noqa: D417 - the results folder documents itself
     run: Annotated[str, Parameter(help="name of a run, or its log")],
     /,
     *,
-    to: Literal["mcap", "csv", "foxglove-layout", "plotjuggler-layout"],
+    to: Literal["mcap", "csv", "parquet", "foxglove-layout", "plotjuggler-layout"],
     file: Path | None = None,
     model: Path | None = None,
-    input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word people use for it
     frame: str = "map",
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     results: Results = Path("results"),
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Export a run as a log, as CSV, or as layouts for viewers.
+    """Export a run as a log, as tables, or as layouts for viewers.
 
     The log can be opened together with the original one.
 
     Args:
         run: name of a run, or its log.
         to: what to write.
-        file: output file (csv: folder); by default in the current folder, named after the run.
-        model: a model file whose velocity and predicted path are exported too (default: the diagnosed model).
-        input: input of the model (default: the command where there is one).
+        file: output file (csv, parquet: folder); by default in the current folder, named after the run.
+        model: a model file whose velocity is exported too (default: the diagnosed model).
         frame: fixed frame of the log's poses.
-        trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report import viewer_files  # noqa: PLC0415
-    from pipeline.report.export_source import ExportSource  # noqa: PLC0415
-    from pipeline.report.viewer_files import write_csv, write_derived_log  # noqa: PLC0415 - heavy
+    from pipeline.estimation.stored_diagnosis import read_slip  # noqa: PLC0415 - heavy
+    from pipeline.report.viewer_files import (  # noqa: PLC0415 - heavy
+        write_layout,
+        write_slip_log,
+        write_tables,
+    )
     from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
-    known = _open_model(model, trust_code=trust_code)
-    chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
-    source = ExportSource(manifest, chosen, input or named_on, frame)
+    models.load_effects(effects or ())
+    known = None if model is None else models.read_model(model)
     path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
-    if to == "csv":
-        written = write_csv(source, path)
+    if to in {"csv", "parquet"}:
+        written = write_tables(manifest, to, path)
+    elif to == "mcap":
+        written = [write_slip_log(manifest, read_slip(manifest, known), path, frame)]
     else:
-        write = {
-            "mcap": write_derived_log,
-            "foxglove-layout": viewer_files.write_foxglove_layout,
-            "plotjuggler-layout": viewer_files.write_plotjuggler_layout,
-        }[to]
-        written = [write(source, path)]
+        written = [write_layout(to, path)]
     files = [str(each) for each in written]
-    omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-    content = {"run": manifest.run, "to": to, "files": files, **omitted}
+    content = {"run": manifest.run, "to": to, "files": files}
     return print_result(content, lambda: files, json=json, quiet=quiet)
-
-
-def _find_named(manifest: Manifest) -> tuple[models.Model | None, str | None]:
-    """The model of the run's diagnosis, and its input; None if there is none."""
-    from pipeline.estimation.stored_diagnosis import read_stored_diagnosis  # noqa: PLC0415 - heavy
-    from pipeline.results import read_model  # noqa: PLC0415 - heavy
-
-    diagnosis = read_stored_diagnosis(manifest)
-    file = None if diagnosis is None else read_model(diagnosis)
-    if diagnosis is None or file is None:
-        return None, None
-    return file.model, diagnosis.input or None

@@ -20,8 +20,8 @@ from pipeline.cli.conventions import (
     FAILED,
     All,
     Choices,
+    OwnEffects,
     Results,
-    TrustCode,
     build_options,
     format_value,
     open_shown,
@@ -66,7 +66,7 @@ def check(  # noqa: D417 - the arguments document themselves
     ] = None,
     to: Annotated[Literal["markdown", "junit"] | None, Parameter(help="format of --file")] = None,
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     results: Results = Path("results"),
     everything: All = False,
     json: bool = False,
@@ -90,7 +90,7 @@ def check(  # noqa: D417 - the arguments document themselves
 
     bounds = None if limits is None else datasets.read_limits(limits)
     options = build_options(Choices(results=results))
-    known = _open_known(before, trust_code=trust_code)
+    known = _open_known(before, effects)
     silent = quiet or json or (to is not None and file is None)
     with ExitStack() as stack:
         first = _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
@@ -155,11 +155,11 @@ def _require_runs(after: str) -> None:
         )
 
 
-def _open_known(name: str, *, trust_code: bool) -> models.ModelFile | datasets.Baseline | None:
+def _open_known(name: str, effects: Sequence[Path] | None) -> models.ModelFile | datasets.Baseline | None:
     """Open a name as a model file or a baseline; None for a log, a folder or a run."""
     path = Path(name)
     if path.suffix == ".toml":
-        return open_model(path, trust_code=trust_code)
+        return open_model(path, effects)
     return datasets.read_baseline(path) if path.suffix == ".json" else None
 
 

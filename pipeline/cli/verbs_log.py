@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import models
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
@@ -21,7 +22,7 @@ from pipeline.cli.conventions import (
     Choices,
     Limit,
     MemoryLimit,
-    TrustCode,
+    OwnEffects,
     build_options,
     exit_code,
     format_vehicle_source,
@@ -34,7 +35,6 @@ from pipeline.cli.conventions import (
     spell_choices,
     summarize_error,
 )
-from pipeline.cli.model_runs import trust_named
 from pipeline.core import (
     LONGEST_NAME,
     FigureFormat,
@@ -71,7 +71,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     report: Annotated[bool, Parameter(negative="--no-report")] = True,
     figures: FigureFormat | None = None,
     model: Path | None = None,
-    trust_code: TrustCode = False,
+    effects: OwnEffects = None,
     force: bool = False,
     limit: Limit,
     everything: All = False,
@@ -84,14 +84,14 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         diagnosis: identify the effects that the model lacks.
         report: write report.html.
         model: a model file to compute slip relative to as well.
-        trust_code: trust the Python that the model file names, now and later.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         everything: show all of the summary: where the error is, budget, limits, topics.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    trust_named(model, wanted=trust_code)
+    if effects:
+        models.load_effects(effects)
     options = build_options(choices)
     options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
     outcomes: list[Outcome] = []
@@ -167,7 +167,7 @@ def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> 
 _OTHER_CLOCK_S = 3600.0
 """Largest offset of stamps of the same clock as log time [s]; others are simulated, since boot, or unset."""
 _LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
-_ROLES = ("command", "wheels", "pose", "imu", "interval", "power")
+_ROLES = ("command", "wheels", "pose", "imu", "interval")
 
 
 def inspect(  # noqa: D417 - the shared choices document themselves
@@ -298,9 +298,9 @@ def _format_roles(seen: Inspection, *, everything: bool) -> list[str]:
     for role in _ROLES if seen.sources else ():
         if source := getattr(seen.sources, role):
             lines.append(f"{role:<10}{source}    {source.reason}")
-        elif role not in {"interval", "power"}:
+        elif role != "interval":
             lines.append(f"{role:<10}none")
-        elif everything and role == "interval":
+        elif everything:
             lines.append(f"{role:<10}none: the whole log counts")
         others = len(seen.choice.ratings) - 1 if seen.choice else 0
         if role == "pose" and others > 0 and not everything:

@@ -23,6 +23,7 @@ from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     Limit,
+    OwnEffects,
     Results,
     print_json,
     print_note,
@@ -38,6 +39,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     port: int = 8321,
     host: str = "127.0.0.1",
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
+    effects: OwnEffects = None,
     timeout: PositiveFloat = 1800.0,
     limit: Limit,
     open_browser: Annotated[bool, Parameter(name="--open")] = False,
@@ -62,9 +64,12 @@ def serve(  # noqa: D417 - the results folder documents itself
     """
     for package in ("uvicorn", "starlette", "numba", "vl_convert"):
         require_package(package, "serve", "the workbench")
+    from pipeline.models import load_effects  # noqa: PLC0415 - heavy
     from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
     from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
+
+    load_effects(effects or ())
 
     def notify(address: str, token: str) -> None:
         whole = f"{address}?token={token}{opened}"

@@ -136,6 +136,7 @@ if TYPE_CHECKING:
         numbers_in,
         objects_in,
         parse_toml,
+        quote_formulas,
         read_bounded,
         read_bounded_text,
         read_object,

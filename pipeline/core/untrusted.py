@@ -380,11 +380,14 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
     import polars.selectors as cs  # noqa: PLC0415
 
     names = pl.Series(frame.columns, dtype=pl.String)
-    safe = dict(zip(frame.columns, names.to_frame("").select(_quote(pl.col(""))).to_series(), strict=True))
-    texts = frame.with_columns(_quote((cs.string() | cs.enum() | cs.categorical()).cast(pl.String)))
+    safe = dict(
+        zip(frame.columns, names.to_frame("").select(quote_formulas(pl.col(""))).to_series(), strict=True)
+    )
+    texts = frame.with_columns(quote_formulas((cs.string() | cs.enum() | cs.categorical()).cast(pl.String)))
     return texts.rename(safe).write_csv(include_header=header, float_precision=digits)
 
 
-def _quote(text: pl.Expr) -> pl.Expr:
+def quote_formulas(text: pl.Expr) -> pl.Expr:
+    """Texts with a quote in front of those that a spreadsheet would take for formulas."""
     # Existing leading quotes get one more, so that the original text can be restored.
     return text.str.replace(f"^('*[{_FORMULA}])", "'$1")

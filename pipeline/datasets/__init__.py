@@ -87,7 +87,7 @@ if TYPE_CHECKING:
         tabulate_fleet,
     )
     from pipeline.datasets.rank_tests import kendall_tau, list_swaps
-    from pipeline.datasets.stored_fits import Against, ModelFit, contest_models, fit_to_runs, read_runs
+    from pipeline.datasets.stored_fits import ModelFit, contest_models, fit_to_runs, read_runs
     from pipeline.datasets.terrain import CELL_M, SHARE_DIGITS, PassEffect, TerrainMap
     from pipeline.datasets.terrain_map import (
         GEOJSON,

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.pooling import ComparisonError
@@ -12,19 +11,14 @@ from pipeline.estimation.estimates import correlations_as_json, parameters_as_js
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import measure_by_terrain
 from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, note_fit, step_as_json
-from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
 from pipeline.estimation.rivals import (
     Contest,
     contest_as_json,
     hold_contest,
-    judge_fit,
-    judge_learned,
     judge_rival,
-    list_learners,
-    time_fit,
 )
 from pipeline.estimation.run_residuals import InputChoice, choose_input
-from pipeline.models import Effect, ModelFile, drop_learned, find_learned, list_models
+from pipeline.models import Effect, ModelFile, list_models
 from pipeline.run import MotionError, MotionRun, load_motion_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
 from pipeline.store import Manifest
@@ -144,13 +138,10 @@ def fit_to_runs(
     data = EstimationData(runs, after.model.vehicle, chosen.source)
     if tie is not None:
         data = tie(data)
-    known, physics = (drop_learned(model) for model in (before.model, after.model))
-    old = new = assess_model(data, replace(known, vehicle=physics.vehicle), per_run=before.per_run)
-    if physics.effects != known.effects:
-        new = assess_model(data, physics, per_run=after.per_run)
-    if find_learned(after.model) is not None:
-        # The residual of the physical model has changed: train the learned term again.
-        new = judge_learned_term(new)
+    known = replace(before.model, vehicle=after.model.vehicle)
+    old = new = assess_model(data, known, per_run=before.per_run)
+    if after.model.effects != known.effects:
+        new = assess_model(data, after.model, per_run=after.per_run)
     return ModelFit(note_fit(after, new), old, new, chosen)
 
 
@@ -161,9 +152,6 @@ def _require_fitted(added: Sequence[Effect], runs: Sequence[MotionRun], chosen: 
         what = f"{unfit.warning}; the model is unchanged"
         hint = "Fit it to a log and an input on which it acts, or choose another effect."
         raise MotionError("not_fitted", what, where=", ".join(unfit.idle), hint=hint)
-
-
-Against = Literal["literature", "learned"]
 
 
 @dataclass(frozen=True)
@@ -194,25 +182,22 @@ def contest_models(
     files: Mapping[str, ModelFile],
     runs: Sequence[MotionRun],
     vehicle: Vehicle,
-    against: Sequence[Against],
     source: str | None = None,
 ) -> ModelContest:
-    """Fit all models to runs, and score each on held-out stretches of ten seconds.
+    """Fit models and those of the literature to runs, and score each on held-out stretches of ten seconds.
 
     Args:
         files: the user's models by name; their values are the start of the fit.
         runs: runs of one vehicle.
         vehicle: vehicle whose geometry is used.
-        against: `literature`, `learned`, or both; the ideal model is always included.
         source: `command` or `measured`; None chooses.
 
     Raises:
-        SlipError: a run lacks the input or is too short, or scikit-learn is not installed.
+        SlipError: a run lacks the input or is too short.
         ComparisonError: ``name_taken``: a model of the user has the name of another model of the comparison.
     """
-    learners = list_learners() if "learned" in against else ()
     known = {model.name: model.make(vehicle) for model in list_models(vehicle)}
-    if taken := files.keys() & {*known, *(learner.name for learner in learners)}:
+    if taken := files.keys() & known.keys():
         what = f"{', '.join(sorted(taken))} is the name of a model that yours is compared with"
         raise ComparisonError("name_taken", what, hint="Give yours another name.")
     last = {file.last_input for file in files.values()}
@@ -220,12 +205,8 @@ def contest_models(
     chosen = choose_input(runs, source, effects, last=last.pop() if len(last) == 1 else None)
     data = EstimationData(runs, vehicle, chosen.source)
     rivals = [
-        judge_with_term(data, name, replace(file.model, vehicle=vehicle), file.per_run)
+        judge_rival(data, name, replace(file.model, vehicle=vehicle), file.per_run)
         for name, file in files.items()
     ]
-    ideal, fit_s = time_fit(data, known.pop("ideal"))
-    rivals.append(judge_fit(data, "ideal", ideal, fit_s))
-    if "literature" in against:
-        rivals += [judge_rival(data, name, model) for name, model in known.items()]
-    rivals += [judge_learned(data, ideal, learner) for learner in learners]
+    rivals += [judge_rival(data, name, model) for name, model in known.items()]
     return ModelContest(hold_contest(data, rivals), chosen, data.names)

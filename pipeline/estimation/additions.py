@@ -16,12 +16,10 @@ from pipeline.core import format_share
 from pipeline.estimation.candidates import Screen
 from pipeline.estimation.decision import LEAST_T, measure_t
 from pipeline.estimation.errors import Errors
-from pipeline.estimation.held_out import number_predictions
 from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
-from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.model_fit import Fitted
-from pipeline.models import LEARNED, Model, explain_idle
+from pipeline.models import Model, explain_idle
 from pipeline.results import CHANCE, format_rises, list_rises
 from pipeline.run import MotionError
 
@@ -181,10 +179,6 @@ def explain_refusals(
     added = [effect for effect in after.fitted.model if effect.id not in before.effects]
     if not added:
         return {}
-    if [one.id for one in added] == [LEARNED]:
-        stretches = np.concatenate(number_predictions(data))
-        said = explain_no_help(before.held_out, after.held_out, stretches)
-        return {LEARNED: said} if said else {}
     idle = {one.id: explain_idle(one, after.effects) for one in added}
     if any(idle.values()):
         return {name: f"it {text}" for name, text in idle.items() if text}

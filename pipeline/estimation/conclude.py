@@ -33,7 +33,6 @@ from pipeline.estimation.estimates import (
     was_aligned,
 )
 from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, list_order, note_fit
-from pipeline.estimation.learned_step import learn_beyond, summarize_learned
 from pipeline.estimation.plausibility import measure_moves
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
@@ -58,7 +57,6 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.decision import Judged, Search, SearchResult
     from pipeline.estimation.estimation_data import EstimationData
-    from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.recordings import Recording
     from pipeline.models import FormulaEffect
 
@@ -135,7 +133,6 @@ def summarize(
         if assessment is not None:
             assessment = dataclasses.replace(assessment, suggested=suggestion.leading)
             assessments[source.value] = assessment
-    learned = None if ground is None else learn_beyond(ground)
     region = _find_region(data, assessment)
     windows, start = data.whole, body.outcome.start.state
     residual = windows.find_residuals(start)
@@ -158,9 +155,7 @@ def summarize(
         ),
         unobservable_why=unobservable,
         detectable=tuple(one for result in results for one in result.detectable if one.id not in hidden),
-        unexplained=_find_unexplained(results, learned, region)
-        if suggestion is None
-        else suggestion.unexplained,
+        unexplained=_find_unexplained(results, region) if suggestion is None else suggestion.unexplained,
         findings=(
             *note_cut(body.search.budget),
             *(() if assessment is None else find_change(assessment)),
@@ -168,9 +163,6 @@ def summarize(
         ladder=() if assessment is None else _list_steps(assessment),
         noise_floor=None if assessment is None else read_result(errors_as_json(assessment.floor), Errors),
         explained_share=math.nan if last is None else last,
-        learned=None
-        if learned is None or ground is None
-        else summarize_learned(learned, ground.ideal.errors, ground.floor),
         where=tuple(pick_regions(regions, residual, windows.noise)),
         when=() if assessment is None else find_moments(assessment),
         by_path=_summarize_paths(results, source, assessments.get("measured")),
@@ -187,14 +179,8 @@ def summarize(
     return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
 
 
-def _find_unexplained(
-    results: Sequence[PathResult], learned: LearnedStep | None, region: Region | None
-) -> Unexplained | None:
-    """What no effect and no formula explains: a learned term, what lasts, or where nearly all of it is."""
-    if learned is not None:
-        described = residual_structure.describe_learned(learned, results[0].name)
-        if described is not None:
-            return described
+def _find_unexplained(results: Sequence[PathResult], region: Region | None) -> Unexplained | None:
+    """What no effect and no formula explains: what lasts, or where nearly all of it is."""
     lasting = (residual_structure.find_lasting(result.outcome.final, result.name) for result in results)
     outcome = next(filter(None, lasting), None)
     if outcome is None and region is not None and is_narrow(region):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -13,8 +13,8 @@ from pipeline.core import Flags, Floats, Newest, SlipError, require_compiler
 from pipeline.estimation.fit import PathFit
 from pipeline.estimation.folds import Fold, find_near, make_folds
 from pipeline.estimation.largest import measure_exceeded, measure_largest
-from pipeline.estimation.model_state import DelayName, ModelState
-from pipeline.estimation.path_residuals import BodyResiduals, PathResiduals, WheelResiduals
+from pipeline.estimation.model_state import DelayName, ModelState, Prior
+from pipeline.estimation.path_residuals import BodyResiduals, PathResiduals, WheelResiduals, tie_prior
 from pipeline.estimation.run_residuals import Input, RunResiduals, choose_rate
 from pipeline.estimation.window_residuals import WindowResiduals
 from pipeline.models import (
@@ -214,6 +214,14 @@ class EstimationData:
         data = self.with_paths(self.paths[:1])
         data.source, data.residuals_by_run = Input.MEASURED, self._measured
         return data
+
+    def with_prior(self, numbers: Mapping[str, tuple[float, float]]) -> EstimationData:
+        """The same runs with a prior on the parameters of a model.
+
+        Args:
+            numbers: mean and standard deviation by label ``effect.name``.
+        """
+        return self.with_paths(tuple(tie_prior(path, Prior(numbers)) for path in self.paths))
 
     def with_paths(self, paths: tuple[PathResiduals, ...]) -> EstimationData:
         """The same runs with other paths, without cached results of the former ones."""

@@ -10,7 +10,6 @@ import numpy as np
 from pipeline.core import Flags, Floats, Ints, nearest_indices
 from pipeline.estimation.errors import Errors, measure_errors
 from pipeline.estimation.folds import refit
-from pipeline.models import LEARNED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -71,9 +70,6 @@ def _score_fold(
         errors of position and yaw, shape (2, m).
     """
     whole, fold, state = data.whole, data.folds[number], refit_fold(data, fitted, number)
-    if learn is not None:
-        # The learned term was trained on all stretches, these included: it is retrained.
-        state = state.drop([LEARNED])
     learned = None if learn is None else learn(state, fold.train)
     residuals, reached = np.full((int(fold.test.sum()), 3), np.nan), []
     for run, run_residuals in enumerate(data.residuals_by_run):

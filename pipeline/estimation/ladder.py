@@ -206,35 +206,27 @@ class ModelAssessment:
 
     Attributes:
         data: the runs.
-        physics: all effects of the model, fitted together, with their held-out errors.
+        whole: all effects of the model, fitted together, with their held-out errors.
         estimates: its parameters with intervals.
         per_run: labels with one value per run.
-        learned: the same with a learned term on top; None without one.
         suggested: the effects with a suggested formula; None without one.
     """
 
     data: EstimationData
-    physics: LadderStep
+    whole: LadderStep
     estimates: Estimates
     per_run: tuple[str, ...] = ()
-    learned: LadderStep | None = None
     suggested: LadderStep | None = None
-
-    @property
-    def whole(self) -> LadderStep:
-        """The whole model."""
-        return self.learned or self.physics
 
     @cached_property
     def ideal(self) -> LadderStep:
         """The ideal model."""
-        return judge_whole(self.data, self.physics.fitted.model.ideal)
+        return judge_whole(self.data, self.whole.fitted.model.ideal)
 
     @cached_property
     def ladder(self) -> Ladder:
         """Held-out errors from the ideal to the whole model."""
-        ladder = _climb_to(self.physics, self.per_run)
-        return ladder if self.learned is None else Ladder((*ladder.steps, self.learned))
+        return _climb_to(self.whole, self.per_run)
 
     @property
     def fitted(self) -> Fitted:
@@ -244,7 +236,7 @@ class ModelAssessment:
     @cached_property
     def floor(self) -> Errors:
         """The noise floor of the runs, by what the physics leaves, and a suggested formula."""
-        return estimate_floor(self.data, (self.suggested or self.physics).fitted.state)
+        return estimate_floor(self.data, (self.suggested or self.whole).fitted.state)
 
 
 def assess_model(data: EstimationData, model: Model, *, per_run: Sequence[str] = ()) -> ModelAssessment:

@@ -69,9 +69,7 @@ def add_model(
     from pipeline.estimation.prediction import predict_at  # noqa: PLC0415 - heavy
 
     slip, model = _remove_model(slip), file.model
-    findings = [
-        Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings
-    ]
+    findings: list[Finding] = []
     if model.vehicle.kind != vehicle.kind:
         what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
         raise MotionError("wrong_model", what, where=where, hint="Give a model of this vehicle.")
@@ -95,6 +93,24 @@ def add_model(
             )
         )
     return pl.concat(parts), tuple(findings)
+
+
+def read_slip(manifest: Manifest, file: ModelFile | None = None) -> pl.DataFrame:
+    """Table `slip` of a stored run, with the velocity of a model in place of the diagnosed one.
+
+    Args:
+        manifest: the run.
+        file: the model; None for what was diagnosed.
+
+    Raises:
+        MotionError: the model is of another kind of vehicle.
+    """
+    slip = manifest.read("slip")
+    if file is None:
+        return slip
+    tables = {name: manifest.read(name) for name in manifest.tables if name in _TABLES}
+    length, vehicle = read_length_scale(manifest), load_vehicle(manifest)
+    return add_model(slip, tables, file, vehicle, length=length, where=manifest.run)[0]
 
 
 def _remove_model(slip: pl.DataFrame) -> pl.DataFrame:

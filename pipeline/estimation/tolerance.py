@@ -27,7 +27,6 @@ from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import find_in_test, number_predictions, refit_fold
 from pipeline.estimation.model_fit import fit_model
 from pipeline.estimation.transfer import fit_as_it_is
-from pipeline.models import drop_learned
 from pipeline.run import HORIZON_S, NODE_S, SPAN_S, STILL_MPS, MotionError
 
 if TYPE_CHECKING:
@@ -284,7 +283,7 @@ def gather_samples(
     for run in runs:
         data = EstimationData([run], file.model.vehicle, source)
         if run.name in known:
-            fitted = fit_model(data, drop_learned(file.model), per_run=file.per_run, exact=True)
+            fitted = fit_model(data, file.model, per_run=file.per_run, exact=True)
         else:
             fitted = fit_as_it_is(data, file.model, file.per_run)
         part = _hold_out_at(data, fitted, ahead_s)

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, hold_out
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.models import Model, drop_learned
+from pipeline.models import Model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -66,7 +66,7 @@ def carry_over(
     for run in runs:
         data = EstimationData([run], model.vehicle, source)
         carried = hold_out(data, fit_as_it_is(data, model, per_run))
-        own = hold_out(data, fit_model(data, drop_learned(model), exact=True))
+        own = hold_out(data, fit_model(data, model, exact=True))
         ideal = hold_out(data, fit_model(data, model.ideal, exact=True))
         ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
         ratio = float(np.exp(np.mean(np.log(ratios))))

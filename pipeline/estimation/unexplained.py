@@ -1,4 +1,4 @@
-"""What no effect of the catalogue explains: a formula, a learned term, or motion that lasts."""
+"""What no effect of the catalogue explains: a formula, or motion that lasts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.core import Floats
     from pipeline.estimation.fit import PathFit
     from pipeline.estimation.ladder import LadderStep, ModelAssessment
-    from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.run_residuals import RunResiduals
     from pipeline.models import FormulaEffect
 
@@ -33,8 +32,6 @@ _SHAPES = 8640
 effects of the catalogue that are right (a lateral skid, drawn sets, seed 44)."""
 _SAME = 0.8
 """Share of what a formula explains from which on an effect of the catalogue explains the same."""
-_LEARNED = 0.1
-"""Share of an error over 2 s that a learned term must remove to be reported as a dependence."""
 _LASTS_S = 1.5
 """Correlation time of a disturbance from which on it lasts."""
 _LEAST_SHARE = 0.5
@@ -154,27 +151,6 @@ def suggest(
         )
         return Suggestion(unexplained, step, said)
     return None
-
-
-def describe_learned(step: LearnedStep, source: str) -> Unexplained | None:
-    """What a learned term removes of the errors, and the input that matters most; None where it is little."""
-    before, after = step.below.pooled, step.held_out.pooled
-    falls = {
-        "x": 1.0 - after.t_mrmse_m / max(before.t_mrmse_m, 1e-12),
-        "w": 1.0 - after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12),
-    }
-    fall = max(falls.values())
-    if step.refusal or fall < _LEARNED or not step.term.inputs:
-        return None
-    sizes = np.abs([one.adds for one in step.term.inputs])
-    scaled = sizes / np.maximum(np.sqrt((sizes**2).sum(axis=0)), 1e-12)
-    channel = 2 if falls["w"] > falls["x"] else int(np.argmax(sizes[:, :2].max(axis=0)))
-    order = np.argsort(-scaled[:, channel])
-    name = step.term.inputs[int(order[0])].name
-    times = float(scaled[order[0], channel] / max(scaled[order[1], channel], 1e-3)) if order.size > 1 else 0.0
-    letter = CHANNELS[channel][-1]
-    quantity = "position" if falls["x"] >= falls["w"] else "heading"
-    return Unexplained("learned", fall, letter, (letter,), source, quantity=quantity, of=name, times=times)
 
 
 def find_lasting(fit: PathFit, path: str) -> Unexplained | None:

@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
@@ -28,6 +29,29 @@ from pipeline.run import MotionError
 from pipeline.sources import Vehicle, check_geometry
 
 Current = Mapping[str, float]
+Value: TypeAlias = "str | Quantity | Callable[[Facts, Current], Amount]"
+"""What a parameter is made of; see `Row`."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter of a target, as data.
+
+    Attributes:
+        path: names of the parent nodes and groups and of the parameter, separated by dots.
+        value: what it is made of: a quantity of the effects, the name of a dimension of the vehicle
+            (`track_width_m`) or of what `Facts` finds (`speed_limit`), with a minus for the opposite, or a
+            function of the facts and of the robot's current parameters; several for a parameter of several.
+        note: what is said beside it.
+        kinds: kinds of vehicles that have it; all of the target without any.
+        change: converts the value to the parameter's unit.
+    """
+
+    path: str
+    value: Value | tuple[Value | float, ...]
+    note: str = ""
+    kinds: tuple[str, ...] = ()
+    change: Callable[..., float] | None = None
 
 
 @dataclass(frozen=True)
@@ -38,17 +62,25 @@ class Target:
         name: name on the command line.
         about: what is written.
         source: reference for the names, units and meanings of its parameters, with the version.
-        write: makes the text from a model file and the current parameters of the robot, by name.
+        kinds: kinds of vehicles it has parameters for.
+        rows: its parameters, in order.
+        complete: adds what is no row, given the facts, the table, and the gate where there are `gates`.
+        write: makes the text of the table.
+        write_file: makes the text from a model file alone, in place of a table.
         corrects: names of the current parameters it reads; empty if all its values are absolute.
         read_current: reads them from the text of the robot's file.
         has_errors: whether it writes held-out errors, for which a log may be given.
-        gates: words that say whether a measured offset is applied, its third argument; empty without one.
+        gates: words that say whether a measured offset is applied, the first by default; empty without one.
     """
 
     name: str
     about: str
     source: str
-    write: Callable[..., str]
+    kinds: tuple[str, ...] = ()
+    rows: tuple[Row, ...] = ()
+    complete: Callable[..., None] | None = None
+    write: Callable[[Facts, ParameterTable], str] | None = None
+    write_file: Callable[[ModelFile], str] | None = None
     corrects: tuple[str, ...] = ()
     read_current: Callable[[str], Current] | None = None
     has_errors: bool = False
@@ -137,14 +169,35 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
     used = dict(current or {})
     check_geometry(file.model.vehicle, file.model.vehicle.id)
     _check_numbers(file, {key: value for key, value in used.items() if key in target.corrects})
-    if gate is None:
-        return target.write(file, used)
-    if gate not in target.gates:
+    if gate is not None and gate not in target.gates:
         what = f"{name} has no gate {gate!r}"
         gated = " and ".join(one.name for one in list_targets() if one.gates)
         hint = f"Give --gate {' or '.join(target.gates)}." if target.gates else f"Omit it; it is for {gated}."
         raise MotionError("no_gate", what, where="--gate", hint=hint)
-    return target.write(file, used, gate)
+    if target.write_file is not None:
+        return target.write_file(file)
+    facts, table = start_table(file, target)
+    for row in target.rows:
+        if not row.kinds or facts.vehicle.kind in row.kinds:
+            _fill_row(row, facts, table, used)
+    if target.complete is not None:
+        target.complete(facts, table, *([gate or target.gates[0]] if target.gates else []))
+    return (target.write or write_yaml)(facts, table)
+
+
+def _fill_row(row: Row, facts: Facts, table: ParameterTable, current: Current) -> None:
+    """Add a parameter to a table, unless something that it needs is unknown."""
+
+    def make(value: Value | float) -> Amount | float:
+        if isinstance(value, float):
+            return value
+        amount = facts.find(value) if isinstance(value, str | Quantity) else value(facts, current)
+        return amount if row.change is None else amount.change(row.change)
+
+    if isinstance(row.value, tuple):
+        table.add_row(row.path, tuple(make(value) for value in row.value), row.note)
+    elif isinstance(amount := make(row.value), Amount):
+        table.add(row.path, amount, row.note)
 
 
 LARGEST = 1e9
@@ -347,6 +400,18 @@ class Facts:
         sources = (f"vehicle {name_entity(self.vehicle)}: {name}",) if known else ()
         return Amount(math.nan if value is None else value, sources)
 
+    def find(self, name: str | Quantity) -> Amount:
+        """Return a quantity, a dimension of the vehicle, or what a method `find_` of that name finds.
+
+        A minus before the name makes it negative.
+        """
+        if isinstance(name, Quantity):
+            return self.take(name)
+        plain = name.removeprefix("-")
+        known = hasattr(self, f"find_{plain}")
+        amount = getattr(self, f"find_{plain}")() if known else self.measure(plain)
+        return -amount if name.startswith("-") else amount
+
     def find_radius(self) -> Amount:
         """Effective wheel radius [m]."""
         return self._scale("wheel_radius_m", Quantity.RADIUS)
@@ -428,10 +493,13 @@ class Facts:
         commanded = self.take(Quantity.TURN_ACCELERATION_LIMIT).change(lambda a, r, k: a * r / k, *gains)
         return _take_least(commanded, self._spin(Quantity.WHEEL_ACCELERATION_LIMIT))
 
-    def find_deadband(self) -> tuple[Amount, Amount]:
-        """Deadband as speed [m/s] when driving straight and as yaw rate [rad/s] when turning on the spot."""
-        rim = self.take(Quantity.DEADBAND).change(operator.mul, self.take(Quantity.RADIUS))
-        return rim, self._turn(rim)
+    def find_deadband_speed(self) -> Amount:
+        """Deadband as speed when driving straight [m/s]."""
+        return self.take(Quantity.DEADBAND).change(operator.mul, self.take(Quantity.RADIUS))
+
+    def find_deadband_turn(self) -> Amount:
+        """Deadband as yaw rate when turning on the spot [rad/s]."""
+        return self._turn(self.find_deadband_speed())
 
     def list_unmapped(self, table: ParameterTable) -> list[str]:
         """Parameters of effects that a table does not cover, one line for each effect."""
@@ -510,17 +578,17 @@ def name_entity(vehicle: Vehicle) -> str:
     return re.sub(r"\W+", "_", vehicle.id) or "robot"
 
 
-def start_table(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, ParameterTable]:
+def start_table(file: ModelFile, target: Target) -> tuple[Facts, ParameterTable]:
     """Facts of a model, and a table with a head that gives vehicle, target and fit.
 
     Raises:
         MotionError: ``wrong_vehicle``, the target has no parameters for this kind of vehicle.
     """
     facts = Facts(file)
-    if facts.vehicle.kind not in kinds:
+    if facts.vehicle.kind not in target.kinds:
         raise MotionError(
             "wrong_vehicle",
-            f"{target.name} has parameters for {' and '.join(kinds)} vehicles; {facts.vehicle.id} is "
+            f"{target.name} has parameters for {' and '.join(target.kinds)} vehicles; {facts.vehicle.id} is "
             f"{facts.vehicle.kind}",
             where=facts.vehicle.id,
             hint="Export to another target: json and python take every vehicle.",

@@ -5,6 +5,7 @@ import io
 import math
 import operator
 import re
+from collections.abc import Callable
 
 import yaml
 
@@ -17,131 +18,93 @@ from pipeline.export import (
     Current,
     Facts,
     ParameterTable,
+    Row,
     Setting,
     Target,
     combine,
     list_comments,
     name_entity,
     quote_name,
-    start_table,
-    write_yaml,
 )
-from pipeline.export.simulator import describe_spread
-from pipeline.models import ModelFile, Quantity
+from pipeline.export.spread import describe_spread
+from pipeline.models import Quantity
 from pipeline.run import MotionError
 
-_CONTROLLER = "controller_server.ros__parameters.FollowPath"
+_ROBOT, _CAR = ("differential",), ("ackermann",)
+_BOTH, _SIDEWAYS = ("differential", "ackermann"), ("mecanum", "omni")
+_FOLLOW = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"
 _DELAY = "MPPI: the sum of dead times and time constants, the delay behind a smooth command"
-
-
-def write_nav2(file: ModelFile, current: Current) -> str:
-    """Write the parameters as YAML; rename the group if the plugin is not called FollowPath.
-
-    Limits are the largest that were reached: smaller ones that are set on purpose remain valid. A vehicle
-    that moves sideways gets delays only: its limits depend on the direction, which these parameters do not.
-
-    Raises:
-        MotionError: ``wrong_vehicle``.
-    """
-    facts, table = start_table(file, NAV2, "differential", "ackermann", "mecanum", "omni")
-    moves_sideways = facts.vehicle.kinematics.has_inputs("sideways")
-    table.add(f"{_CONTROLLER}.model_delay_vx", facts.find_speed_delay(), _DELAY)
-    if moves_sideways:
-        table.add(f"{_CONTROLLER}.model_delay_vy", facts.find_speed_delay(), _DELAY)
-    table.add(f"{_CONTROLLER}.model_delay_wz", facts.find_turn_delay(), _DELAY)
-    if not moves_sideways:
-        _add_limits_of_nav2(facts, table)
-    if facts.vehicle.kind == "ackermann":
-        key = f"{_CONTROLLER}.ackermann.min_turning_r"
-        table.add(key, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
-    return write_yaml(facts, table)
-
-
-def _add_limits_of_nav2(facts: Facts, table: ParameterTable) -> None:
-    speed, turn = facts.find_speed_limit(), facts.find_turn_limit()
-    acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
-    table.add(f"{_CONTROLLER}.vx_max", speed, "MPPI")
-    table.add(f"{_CONTROLLER}.vx_min", -speed, "MPPI")
-    table.add(f"{_CONTROLLER}.wz_max", turn, "MPPI")
-    table.add(f"{_CONTROLLER}.ax_max", acceleration, "MPPI")
-    table.add(f"{_CONTROLLER}.ax_min", -acceleration, "MPPI")
-    table.add(f"{_CONTROLLER}.az_max", turning, "MPPI")
-    table.add_row(
-        f"{_CONTROLLER}.VelocityDeadbandCritic.deadband_velocities",
-        (facts.find_deadband()[0], 0.0, facts.find_deadband()[1]),
-        "MPPI with VelocityDeadbandCritic among its critics",
-    )
-    pursuit = "regulated pure pursuit"
-    table.add(f"{_CONTROLLER}.max_linear_vel", speed, f"{pursuit}; desired_linear_vel up to Kilted")
-    table.add(f"{_CONTROLLER}.min_linear_vel", -speed, pursuit)
-    table.add(f"{_CONTROLLER}.max_angular_vel", turn, pursuit)
-    table.add(f"{_CONTROLLER}.min_angular_vel", -turn, pursuit)
-    table.add(f"{_CONTROLLER}.max_linear_accel", acceleration, pursuit)
-    table.add(f"{_CONTROLLER}.max_linear_decel", -acceleration, pursuit)
-    table.add(f"{_CONTROLLER}.max_angular_accel", turning, pursuit)
-    table.add(f"{_CONTROLLER}.max_angular_decel", -turning, pursuit)
-    # The smoother needs a limit for every axis or for none.
-    table.add_row(f"{_SMOOTHER}.max_velocity", (speed, 0.0, turn))
-    table.add_row(f"{_SMOOTHER}.min_velocity", (-speed, 0.0, -turn))
-    table.add_row(f"{_SMOOTHER}.max_accel", (acceleration, 0.0, turning))
-    table.add_row(f"{_SMOOTHER}.max_decel", (-acceleration, 0.0, -turning))
-
+_PURSUIT = "regulated pure pursuit"
 
 NAV2 = Target(
     "nav2",
     "parameters of Nav2's MPPI, regulated pure pursuit and velocity smoother",
     "ros-navigation/navigation2 1.5 (Lyrical), parameters declared by nav2_mppi_controller, "
     "nav2_regulated_pure_pursuit_controller and nav2_velocity_smoother",
-    write_nav2,
+    (*_BOTH, *_SIDEWAYS),
+    # Limits are the largest that were reached: smaller ones that are set on purpose remain valid. A vehicle
+    # that moves sideways gets delays only: its limits depend on the direction, which these parameters do not.
+    (
+        Row(f"{_FOLLOW}.model_delay_vx", "speed_delay", _DELAY),
+        Row(f"{_FOLLOW}.model_delay_vy", "speed_delay", _DELAY, _SIDEWAYS),
+        Row(f"{_FOLLOW}.model_delay_wz", "turn_delay", _DELAY),
+        Row(f"{_FOLLOW}.vx_max", "speed_limit", "MPPI", _BOTH),
+        Row(f"{_FOLLOW}.vx_min", "-speed_limit", "MPPI", _BOTH),
+        Row(f"{_FOLLOW}.wz_max", "turn_limit", "MPPI", _BOTH),
+        Row(f"{_FOLLOW}.ax_max", "speed_acceleration", "MPPI", _BOTH),
+        Row(f"{_FOLLOW}.ax_min", "-speed_acceleration", "MPPI", _BOTH),
+        Row(f"{_FOLLOW}.az_max", "turn_acceleration", "MPPI", _BOTH),
+        Row(
+            f"{_FOLLOW}.VelocityDeadbandCritic.deadband_velocities",
+            ("deadband_speed", 0.0, "deadband_turn"),
+            "MPPI with VelocityDeadbandCritic among its critics",
+            _BOTH,
+        ),
+        Row(
+            f"{_FOLLOW}.max_linear_vel", "speed_limit", f"{_PURSUIT}; desired_linear_vel up to Kilted", _BOTH
+        ),
+        Row(f"{_FOLLOW}.min_linear_vel", "-speed_limit", _PURSUIT, _BOTH),
+        Row(f"{_FOLLOW}.max_angular_vel", "turn_limit", _PURSUIT, _BOTH),
+        Row(f"{_FOLLOW}.min_angular_vel", "-turn_limit", _PURSUIT, _BOTH),
+        Row(f"{_FOLLOW}.max_linear_accel", "speed_acceleration", _PURSUIT, _BOTH),
+        Row(f"{_FOLLOW}.max_linear_decel", "-speed_acceleration", _PURSUIT, _BOTH),
+        Row(f"{_FOLLOW}.max_angular_accel", "turn_acceleration", _PURSUIT, _BOTH),
+        Row(f"{_FOLLOW}.max_angular_decel", "-turn_acceleration", _PURSUIT, _BOTH),
+        # The smoother needs a limit for every axis or for none.
+        Row(f"{_SMOOTHER}.max_velocity", ("speed_limit", 0.0, "turn_limit"), "", _BOTH),
+        Row(f"{_SMOOTHER}.min_velocity", ("-speed_limit", 0.0, "-turn_limit"), "", _BOTH),
+        Row(f"{_SMOOTHER}.max_accel", ("speed_acceleration", 0.0, "turn_acceleration"), "", _BOTH),
+        Row(f"{_SMOOTHER}.max_decel", ("-speed_acceleration", 0.0, "-turn_acceleration"), "", _BOTH),
+        Row(
+            f"{_FOLLOW}.ackermann.min_turning_r", "turning_radius", "MPPI with motion_model: ackermann", _CAR
+        ),
+    ),
 )
 
+_DIFF = "diff_drive_controller.ros__parameters"
+_ACKERMANN = "ackermann_steering_controller.ros__parameters"
 
-def write_ros2_control(file: ModelFile, current: Current) -> str:
-    """Write the parameters as YAML; they replace those of the controller.
 
-    Raises:
-        MotionError: ``wrong_vehicle``.
-    """
-    facts, table = start_table(file, ROS2_CONTROL, "differential", "ackermann")
+def _scale_side(sign: float) -> Callable[[Facts, Current], Amount]:
+    """The multiplier of the radius of a side: -1 is the left one."""
+
+    def find(facts: Facts, _: Current) -> Amount:
+        radius, difference = facts.take(Quantity.RADIUS), facts.take(Quantity.RADIUS_DIFFERENCE)
+        return combine(lambda k, e: k * (1.0 + sign * e / 2.0), radius, difference)
+
+    return find
+
+
+def _remark(facts: Facts, table: ParameterTable) -> None:
+    """Say what other versions call it, and which multipliers depend on the speed."""
     if facts.vehicle.kind == "differential":
-        _add_differential(facts, table)
+        table.head += describe_spread(facts)
+        table.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
     else:
-        _add_ackermann(facts, table)
-    return write_yaml(facts, table)
-
-
-def _add_differential(facts: Facts, table: ParameterTable) -> None:
-    node = "diff_drive_controller.ros__parameters"
-    radius, difference = facts.take(Quantity.RADIUS), facts.take(Quantity.RADIUS_DIFFERENCE)
-    table.add(f"{node}.wheel_separation", facts.measure("track_width_m"))
-    table.add(f"{node}.wheel_radius", facts.measure("wheel_radius_m"))
-    track = facts.take(Quantity.TRACK)
-    table.add(f"{node}.wheel_separation_multiplier", track, "replaces the present multiplier")
-    left = combine(lambda k, e: k * (1.0 - e / 2.0), radius, difference)
-    right = combine(lambda k, e: k * (1.0 + e / 2.0), radius, difference)
-    table.add(f"{node}.left_wheel_radius_multiplier", left)
-    table.add(f"{node}.right_wheel_radius_multiplier", right)
-    for axis, limit, acceleration in (
-        ("linear.x", facts.find_speed_limit(), facts.find_speed_acceleration()),
-        ("angular.z", facts.find_turn_limit(), facts.find_turn_acceleration()),
-    ):
-        table.add(f"{node}.{axis}.max_velocity", limit)
-        table.add(f"{node}.{axis}.min_velocity", -limit)
-        table.add(f"{node}.{axis}.max_acceleration", acceleration)
-        table.add(f"{node}.{axis}.max_deceleration", -acceleration)
-    table.head += describe_spread(facts)
-    table.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
-
-
-def _add_ackermann(facts: Facts, table: ParameterTable) -> None:
-    node = "ackermann_steering_controller.ros__parameters"
-    table.add(f"{node}.wheelbase", facts.find_wheelbase())
-    table.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
-    table.add(f"{node}.traction_wheels_radius", facts.find_radius())
-    table.head.append(
-        "On Humble traction_track_width is rear_wheel_track, traction_wheels_radius rear_wheels_radius."
-    )
+        table.head.append(
+            "On Humble traction_track_width is rear_wheel_track, traction_wheels_radius rear_wheels_radius."
+        )
 
 
 ROS2_CONTROL = Target(
@@ -149,7 +112,30 @@ ROS2_CONTROL = Target(
     "parameters of ros2_control's wheeled controllers",
     "ros-controls/ros2_controllers 4.42 (Jazzy) to 6.9 (Rolling), diff_drive_controller_parameter.yaml and "
     "ackermann_steering_controller.yaml",
-    write_ros2_control,
+    _BOTH,
+    (
+        Row(f"{_DIFF}.wheel_separation", "track_width_m", "", _ROBOT),
+        Row(f"{_DIFF}.wheel_radius", "wheel_radius_m", "", _ROBOT),
+        Row(
+            f"{_DIFF}.wheel_separation_multiplier", Quantity.TRACK, "replaces the present multiplier", _ROBOT
+        ),
+        Row(f"{_DIFF}.left_wheel_radius_multiplier", _scale_side(-1.0), "", _ROBOT),
+        Row(f"{_DIFF}.right_wheel_radius_multiplier", _scale_side(1.0), "", _ROBOT),
+        *(
+            Row(f"{_DIFF}.{axis}.{bound}", f"{sign}{motion}_{limit}", "", _ROBOT)
+            for axis, motion in (("linear.x", "speed"), ("angular.z", "turn"))
+            for bound, sign, limit in (
+                ("max_velocity", "", "limit"),
+                ("min_velocity", "-", "limit"),
+                ("max_acceleration", "", "acceleration"),
+                ("max_deceleration", "-", "acceleration"),
+            )
+        ),
+        Row(f"{_ACKERMANN}.wheelbase", "wheelbase", "", _CAR),
+        Row(f"{_ACKERMANN}.traction_track_width", "track_width_m", "", _CAR),
+        Row(f"{_ACKERMANN}.traction_wheels_radius", "radius", "", _CAR),
+    ),
+    _remark,
 )
 
 _ALL = "/**.ros__parameters"
@@ -158,37 +144,6 @@ _MPC = "mpc_lateral_controller"
 _ESTIMATOR = "steer_offset_estimator"
 _PID = "pid_longitudinal_controller"
 _SIMULATOR = "simple_planning_simulator with vehicle_model_type: DELAY_STEER_VEL"
-
-
-def write_autoware(file: ModelFile, current: Current, gate: str = "auto") -> str:
-    """Write the parameters as YAML: one file for all nodes; each reads those that it declares.
-
-    Args:
-        file: a fitted model.
-        current: not used.
-        gate: `off`, the steering offset is not applied; `on`, it is applied as measured; `auto`, applied
-            and learned on by Autoware, where it drives as when the offset was measured.
-
-    Raises:
-        MotionError: ``wrong_vehicle``.
-    """
-    facts, table = start_table(file, AUTOWARE, "ackermann")
-    table.add(f"{_ALL}.wheel_radius", facts.find_radius(), _INFO)
-    table.add(f"{_ALL}.wheel_base", facts.find_wheelbase(), _INFO)
-    table.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)
-    table.add(f"{_ALL}.max_steer_angle", facts.measure("max_steering_rad"), _INFO)
-    delay, lag = facts.take(Quantity.COMMAND_DELAY), facts.take(Quantity.STEERING_LAG)
-    table.add(f"{_ALL}.input_delay", delay, _MPC)
-    table.add(f"{_ALL}.vehicle_model_steer_tau", lag, f"{_MPC} with vehicle_model_type: kinematics")
-    table.add(f"{_ALL}.delay_compensation_time", delay, _PID)
-    table.add(f"{_ALL}.vel_time_delay", delay, _SIMULATOR)
-    table.add(f"{_ALL}.vel_time_constant", facts.take(Quantity.SPEED_LAG), _SIMULATOR)
-    table.add(f"{_ALL}.steer_time_delay", delay, _SIMULATOR)
-    table.add(f"{_ALL}.steer_time_constant", lag, _SIMULATOR)
-    table.add(f"{_ALL}.vel_lim", facts.find_speed_limit(), _SIMULATOR)
-    table.add(f"{_ALL}.vel_rate_lim", facts.find_speed_acceleration(), _SIMULATOR)
-    _add_offset(facts, table, gate)
-    return write_yaml(facts, table)
 
 
 def _add_offset(facts: Facts, table: ParameterTable, gate: str) -> None:
@@ -242,36 +197,34 @@ AUTOWARE = Target(
     "autowarefoundation/autoware_universe, README of autoware_simple_planning_simulator and of "
     "autoware_steer_offset_estimator and its node.cpp, lateral_controller_defaults.param.yaml; "
     "sample_vehicle_launch, vehicle_info.param.yaml",
-    write_autoware,
-    gates=("off", "on", "auto"),
+    _CAR,
+    (
+        Row(f"{_ALL}.wheel_radius", "radius", _INFO),
+        Row(f"{_ALL}.wheel_base", "wheelbase", _INFO),
+        Row(f"{_ALL}.wheel_tread", "track_width_m", _INFO),
+        Row(f"{_ALL}.max_steer_angle", "max_steering_rad", _INFO),
+        Row(f"{_ALL}.input_delay", Quantity.COMMAND_DELAY, _MPC),
+        Row(
+            f"{_ALL}.vehicle_model_steer_tau",
+            Quantity.STEERING_LAG,
+            f"{_MPC} with vehicle_model_type: kinematics",
+        ),
+        Row(f"{_ALL}.delay_compensation_time", Quantity.COMMAND_DELAY, _PID),
+        Row(f"{_ALL}.vel_time_delay", Quantity.COMMAND_DELAY, _SIMULATOR),
+        Row(f"{_ALL}.vel_time_constant", Quantity.SPEED_LAG, _SIMULATOR),
+        Row(f"{_ALL}.steer_time_delay", Quantity.COMMAND_DELAY, _SIMULATOR),
+        Row(f"{_ALL}.steer_time_constant", Quantity.STEERING_LAG, _SIMULATOR),
+        Row(f"{_ALL}.vel_lim", "speed_limit", _SIMULATOR),
+        Row(f"{_ALL}.vel_rate_lim", "speed_acceleration", _SIMULATOR),
+    ),
+    _add_offset,
+    gates=("auto", "off", "on"),
 )
 
 _REAL32 = 9
 """MAV_PARAM_TYPE_REAL32: the type of all these parameters."""
 
 _FULL_SPEED = "RO_MAX_THR_SPEED"
-
-
-def write_px4(file: ModelFile, current: Current) -> str:
-    """Write the parameters with comments, tabs between vehicle, component, name, value and type.
-
-    Args:
-        file: a fitted model.
-        current: the speed at full throttle used for the log, which the wheel radius corrects.
-
-    Raises:
-        MotionError: ``wrong_vehicle``.
-    """
-    facts, table = start_table(file, PX4, "differential", "ackermann")
-    if facts.vehicle.kind == "differential":
-        table.add("RD_WHEEL_TRACK", facts.measure("track_width_m"))
-        table.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))
-    else:
-        table.add("RA_WHEEL_BASE", facts.find_wheelbase())
-        table.add("RA_MAX_STR_ANG", facts.find_largest_steering())
-    table.add(_FULL_SPEED, _find_full_speed(facts, current))
-    _add_limits(facts, table)
-    return _write_lines(facts, table)
 
 
 def read_px4(text: str) -> Current:
@@ -302,19 +255,6 @@ def _find_full_speed(facts: Facts, current: Current) -> Amount:
     return combine(operator.mul, facts.take(Quantity.RADIUS), used)
 
 
-def _add_limits(facts: Facts, table: ParameterTable) -> None:
-    acceleration = facts.find_speed_acceleration()
-    turn, turning = (
-        amount.change(math.degrees) for amount in (facts.find_turn_limit(), facts.find_turn_acceleration())
-    )
-    table.add("RO_SPEED_LIM", facts.find_speed_limit())
-    table.add("RO_YAW_RATE_LIM", turn, "in deg/s")
-    table.add("RO_ACCEL_LIM", acceleration)
-    table.add("RO_DECEL_LIM", acceleration)
-    table.add("RO_YAW_ACCEL_LIM", turning, "in deg/s^2")
-    table.add("RO_YAW_DECEL_LIM", turning, "in deg/s^2")
-
-
 def _write_lines(facts: Facts, table: ParameterTable) -> str:
     text = io.StringIO()
     writer = csv.writer(text, delimiter="\t", lineterminator="\n")
@@ -331,7 +271,21 @@ PX4 = Target(
     "parameters of a PX4 rover, for QGroundControl",
     "PX4/PX4-Autopilot after 1.16, src/modules/rover_differential and rover_ackermann/module.yaml, "
     "src/lib/rover_control/rovercontrol_params.yaml",
-    write_px4,
+    _BOTH,
+    (
+        Row("RD_WHEEL_TRACK", "track_width_m", "", _ROBOT),
+        Row("RO_YAW_RATE_CORR", Quantity.TRACK, "", _ROBOT),
+        Row("RA_WHEEL_BASE", "wheelbase", "", _CAR),
+        Row("RA_MAX_STR_ANG", "largest_steering", "", _CAR),
+        Row(_FULL_SPEED, _find_full_speed),
+        Row("RO_SPEED_LIM", "speed_limit"),
+        Row("RO_YAW_RATE_LIM", "turn_limit", "in deg/s", change=math.degrees),
+        Row("RO_ACCEL_LIM", "speed_acceleration"),
+        Row("RO_DECEL_LIM", "speed_acceleration"),
+        Row("RO_YAW_ACCEL_LIM", "turn_acceleration", "in deg/s^2", change=math.degrees),
+        Row("RO_YAW_DECEL_LIM", "turn_acceleration", "in deg/s^2", change=math.degrees),
+    ),
+    write=_write_lines,
     corrects=(_FULL_SPEED,),
     read_current=read_px4,
 )
@@ -339,33 +293,6 @@ PX4 = Target(
 _SPEED_GAIN = "speed_to_erpm_gain"
 _STEERING_GAIN = "steering_angle_to_servo_gain"
 _STEERING_OFFSET = "steering_angle_to_servo_offset"
-
-
-def write_vesc(file: ModelFile, current: Current) -> str:
-    """Write the parameters as YAML: current gains and offset, corrected so that the car follows its commands.
-
-    A car that steers by g u + o and drives k times its speed needs u = (wanted - o) / g and wanted / k.
-
-    Args:
-        file: a fitted model.
-        current: gains and offset that converted the speeds and angles of the log to ERPM and servo values;
-            if missing, those of the vehicle's preset, which were used for reading commands in ERPM.
-
-    Raises:
-        MotionError: ``wrong_vehicle``; ``gains_unknown``, neither is there.
-    """
-    facts, table = start_table(file, VESC, "ackermann")
-    speed, servo, centre = (_find_current(facts, current, name) for name in VESC.corrects)
-    radius = facts.take(Quantity.RADIUS)
-    gain, offset = facts.take(Quantity.STEERING_GAIN), facts.take(Quantity.STEERING_OFFSET)
-    table.add(f"{_ALL}.{_SPEED_GAIN}", combine(operator.truediv, speed, radius))
-    table.add(f"{_ALL}.{_STEERING_GAIN}", combine(operator.truediv, servo, gain))
-    straight = combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)
-    table.add(f"{_ALL}.{_STEERING_OFFSET}", straight)
-    table.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.find_wheelbase())
-    limit = facts.find_speed_acceleration()
-    table.add("throttle_interpolator.ros__parameters.max_acceleration", limit)
-    return write_yaml(facts, table)
 
 
 def read_vesc(text: str) -> Current:
@@ -413,12 +340,37 @@ def _find_current(facts: Facts, current: Current, name: str) -> Amount:
     return Amount(value, (source,))
 
 
+# A car that steers by g u + o and drives k times its speed needs u = (wanted - o) / g and wanted / k.
+
+
+def _correct_speed(facts: Facts, current: Current) -> Amount:
+    return combine(operator.truediv, _find_current(facts, current, _SPEED_GAIN), facts.take(Quantity.RADIUS))
+
+
+def _correct_steering(facts: Facts, current: Current) -> Amount:
+    gain = facts.take(Quantity.STEERING_GAIN)
+    return combine(operator.truediv, _find_current(facts, current, _STEERING_GAIN), gain)
+
+
+def _correct_centre(facts: Facts, current: Current) -> Amount:
+    servo, centre = (_find_current(facts, current, name) for name in (_STEERING_GAIN, _STEERING_OFFSET))
+    gain, offset = facts.take(Quantity.STEERING_GAIN), facts.take(Quantity.STEERING_OFFSET)
+    return combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)
+
+
 VESC = Target(
     "vesc",
     "gains and offsets of vesc.yaml",
     "f1tenth/vesc, vesc_ackermann/src/ackermann_to_vesc.cpp (erpm = gain * speed + offset, servo likewise); "
     "f1tenth/f1tenth_system, f1tenth_stack/config/vesc.yaml",
-    write_vesc,
+    _CAR,
+    (
+        Row(f"{_ALL}.{_SPEED_GAIN}", _correct_speed),
+        Row(f"{_ALL}.{_STEERING_GAIN}", _correct_steering),
+        Row(f"{_ALL}.{_STEERING_OFFSET}", _correct_centre),
+        Row("vesc_to_odom_node.ros__parameters.wheelbase", "wheelbase"),
+        Row("throttle_interpolator.ros__parameters.max_acceleration", "speed_acceleration"),
+    ),
     corrects=(_SPEED_GAIN, _STEERING_GAIN, _STEERING_OFFSET),
     read_current=read_vesc,
 )

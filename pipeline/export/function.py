@@ -27,9 +27,7 @@ from pipeline.models import (
     Model,
     Place,
     Ramp,
-    ResidualTerm,
     Written,
-    find_kind,
     is_own,
 )
 from pipeline.run import MotionError
@@ -83,7 +81,6 @@ def _write_step(effect: Effect, vehicle: Vehicle) -> _Step:
         return _Step(_fill(known.step, effect), known.state)
     writers: dict[type[Effect], Callable[[Any], _Step]] = {
         FormulaEffect: _write_formula,
-        ResidualTerm: _write_learned,
         Delay: lambda _effect: _Step(""),  # the function reads commands with this delay
         Lag: _write_lag,
         Ramp: _write_ramp,
@@ -176,32 +173,6 @@ def _write_ramp(effect: Ramp) -> _Step:
         own = _READ[signal]
         text = f"{state} = approach({state}, {own}, {most} * step_s)\nadded = {state} - {own}\n{_ADD[signal]}"
     return _Step(text, (state,))
-
-
-def _write_learned(term: ResidualTerm) -> _Step:
-    """Step of a learned term, whose vehicle starts at rest without an initial error."""
-    used = [(one, kind) for one in term.inputs if (kind := find_kind(one.name)).formula != "0.0"]
-    if not term.inputs:
-        return _Step("")
-    states = [kind.state for _, kind in used if kind.state]
-    lines = [
-        f"{name} += ({channel} - {name}) * -math.expm1(-step_s / {tau_s!r})"
-        for name, channel, tau_s in states
-    ]
-    lines.append("learned = (  # input / scale, low and high over scale, what it adds to v_x, v_y, v_w")
-    for one, kind in used:
-        numbers = ", ".join(repr(float(x)) for x in (one.low / one.scale, one.high / one.scale, *one.adds))
-        lines.append(f"    ({kind.formula} / {one.scale!r}, {numbers}),  # {one.name}")
-    lines += [
-        ")",
-        "beyond = sum(max(low - z, z - high, 0.0) ** 2 for z, low, high, *_ in learned)",
-        "share = math.exp(-beyond / 2.0)",
-        *(
-            f"{channel} = {channel} + share * sum(row[0] * row[{index}] for row in learned)"
-            for index, channel in enumerate(("v_x", "v_y", "v_w"), start=3)
-        ),
-    ]
-    return _Step("\n".join(lines), tuple(name for name, _, _ in states))
 
 
 def _write_head(model: Model, state: list[str]) -> str:
@@ -302,5 +273,5 @@ PYTHON = Target(
     "python",
     "a function that predicts poses from commands",
     "the function's docstring",
-    lambda file, _current: write_function(file.model),
+    write_file=lambda file: write_function(file.model),
 )

@@ -3,48 +3,12 @@
 from xml.etree import ElementTree as ET
 
 from pipeline.core import make_plain
-from pipeline.export import Current, Facts, ParameterTable, Target, list_comments, start_table
-from pipeline.models import ModelFile
+from pipeline.export import Facts, ParameterTable, Row, Target, list_comments
 
 _DRIVE_PLUGINS = {
     "differential": ("gz-sim-diff-drive-system", "gz::sim::systems::DiffDrive"),
     "ackermann": ("gz-sim-ackermann-steering-system", "gz::sim::systems::AckermannSteering"),
 }
-
-
-def write_gazebo(file: ModelFile, current: Current) -> str:
-    """Write a plugin element without its joints and topics, which only the model's SDF contains.
-
-    Raises:
-        MotionError: ``wrong_vehicle``.
-    """
-    facts, table = start_table(file, GAZEBO, *_DRIVE_PLUGINS)
-    table.add("plugin.wheel_radius", facts.find_radius())
-    if facts.vehicle.kind == "differential":
-        note = "for a simulated ground on which the wheels skid as on the real one"
-        table.add("plugin.wheel_separation", facts.find_track(), note)
-    else:
-        table.add("plugin.wheel_separation", facts.measure("track_width_m"))
-        table.add("plugin.wheel_base", facts.find_wheelbase())
-        table.add("plugin.steering_limit", facts.find_largest_steering())
-    _add_limits_of_gazebo(facts, table)
-    return _write_element(facts, table)
-
-
-def _add_limits_of_gazebo(facts: Facts, table: ParameterTable) -> None:
-    linear = "linear_" if facts.vehicle.kind == "differential" else ""
-    limits = [
-        (f"{linear}velocity", facts.find_speed_limit()),
-        (f"{linear}acceleration", facts.find_speed_acceleration()),
-    ]
-    if facts.vehicle.kind == "differential":
-        limits += [
-            ("angular_velocity", facts.find_turn_limit()),
-            ("angular_acceleration", facts.find_turn_acceleration()),
-        ]
-    for name, limit in limits:
-        table.add(f"plugin.min_{name}", -limit)
-        table.add(f"plugin.max_{name}", limit)
 
 
 def _write_element(facts: Facts, table: ParameterTable) -> str:
@@ -68,9 +32,35 @@ def _write_comment(text: str) -> str:
     return f" {make_plain(text).replace('--', _DASHES)} "
 
 
+_ROBOT, _CAR = ("differential",), ("ackermann",)
 GAZEBO = Target(
     "gazebo",
     "the drive plugin of a model in Gazebo, without joints and topics",
     "gazebosim/gz-sim 11, src/systems: diff_drive/DiffDrive.hh, ackermann_steering/AckermannSteering.hh",
-    write_gazebo,
+    tuple(_DRIVE_PLUGINS),
+    (
+        Row("plugin.wheel_radius", "radius"),
+        Row(
+            "plugin.wheel_separation",
+            "track",
+            "for a simulated ground on which the wheels skid as on the real one",
+            _ROBOT,
+        ),
+        Row("plugin.wheel_separation", "track_width_m", "", _CAR),
+        Row("plugin.wheel_base", "wheelbase", "", _CAR),
+        Row("plugin.steering_limit", "largest_steering", "", _CAR),
+        *(
+            Row(f"plugin.{bound}_{name}", f"{sign}{value}", "", kinds)
+            for name, value, kinds in (
+                ("linear_velocity", "speed_limit", _ROBOT),
+                ("velocity", "speed_limit", _CAR),
+                ("linear_acceleration", "speed_acceleration", _ROBOT),
+                ("acceleration", "speed_acceleration", _CAR),
+                ("angular_velocity", "turn_limit", _ROBOT),
+                ("angular_acceleration", "turn_acceleration", _ROBOT),
+            )
+            for bound, sign in (("min", "-"), ("max", ""))
+        ),
+    ),
+    write=_write_element,
 )

@@ -6,12 +6,11 @@ import msgspec
 
 from pipeline.export import (
     Amount,
-    Current,
+    Facts,
+    ParameterTable,
     Setting,
     Target,
     require_plausible,
-    start_table,
-    write_yaml,
 )
 from pipeline.models import Effect, ModelFile, Place, Quantity
 from pipeline.run import MotionError
@@ -33,8 +32,8 @@ _INDEPENDENT = (
 )
 
 
-def write_robot_localization(file: ModelFile, current: Current) -> str:
-    """Write the parameters as YAML.
+def _add_covariance(facts: Facts, table: ParameterTable) -> None:
+    """Add the covariance of the odometry.
 
     The filter has no parameter for the covariance of a measurement: it comes with the odometry messages,
     whose controller gets it here. Variances are the squares of the held-out errors over half a second, from
@@ -42,9 +41,9 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
     own noise, so they are too large rather than too small.
 
     Raises:
-        MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
+        MotionError: ``not_fitted``, the file has no ladder.
     """
-    facts, table = start_table(file, ROBOT_LOCALIZATION, *_CONTROLLERS)
+    file = facts.file
     controller, known = _CONTROLLERS[facts.vehicle.kind]
     step = _find_step(file, known)
     sources = (
@@ -61,7 +60,6 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
         table.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")
     key = f"{controller}.ros__parameters.twist_covariance_diagonal"
     table.add_row(key, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
-    return write_yaml(facts, table)
 
 
 class _Step(msgspec.Struct):
@@ -111,7 +109,8 @@ ROBOT_LOCALIZATION = Target(
     "the covariance of wheel odometry for robot_localization",
     "cra-ros-pkg/robot_localization 3.6, params/ekf.yaml and preparing_sensor_data.rst; the filter takes "
     "covariances from the messages, which ros-controls/ros2_controllers fills from twist_covariance_diagonal",
-    write_robot_localization,
+    tuple(_CONTROLLERS),
+    complete=_add_covariance,
     has_errors=True,
 )
 
@@ -119,13 +118,13 @@ ROBOT_LOCALIZATION = Target(
 _AMCL = "amcl.ros__parameters"
 
 
-def write_amcl(file: ModelFile, current: Current) -> str:
-    """Write the parameters as YAML: noise of the odometry that AMCL moves its particles by.
+def _add_alphas(facts: Facts, table: ParameterTable) -> None:
+    """Add the noise of the odometry that AMCL moves its particles by.
 
     Raises:
-        MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder, or none of measured wheels.
+        MotionError: ``not_fitted``, the file has no ladder, or none of measured wheels.
     """
-    facts, table = start_table(file, NAV2_AMCL, *_CONTROLLERS)
+    file = facts.file
     known = _CONTROLLERS[facts.vehicle.kind][1]
     step = _find_step(file, known)
     if step.odometry_alphas is None:
@@ -146,7 +145,6 @@ def write_amcl(file: ModelFile, current: Current) -> str:
         table.add(f"{_AMCL}.alpha{number}", Amount(float(f"{alpha:.3g}"), (note, *sources)))
     for name, least in (("update_min_d", UPDATE_M), ("update_min_a", UPDATE_RAD)):
         table.add(f"{_AMCL}.{name}", Amount(least, ("the alphas are those of updates after this motion",)))
-    return write_yaml(facts, table)
 
 
 UPDATE_M, UPDATE_RAD = 0.25, 0.2
@@ -157,6 +155,7 @@ NAV2_AMCL = Target(
     "AMCL's noise of wheel odometry",
     "ros-navigation/navigation2 1.5 (Lyrical), nav2_amcl: alpha1 to alpha4 of the differential motion model "
     "(Thrun, Burgard and Fox, Probabilistic Robotics, table 5.6)",
-    write_amcl,
+    tuple(_CONTROLLERS),
+    complete=_add_alphas,
     has_errors=True,
 )

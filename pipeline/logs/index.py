@@ -20,7 +20,6 @@ from pipeline.core import (
 )
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.compressed import COMPRESSED, uncompressed_name
-from pipeline.logs.other_formats import list_tables
 from pipeline.logs.part import (
     catalog_file,
     count_fetched,
@@ -178,9 +177,8 @@ def open_log(
     """Build the index of a recording.
 
     Args:
-        path: an MCAP file or object (``s3://bucket/key``), a ROS 1 bag, an SQLite file of rosbag2, the
-            folder of a split recording (with or without the ``metadata.yaml`` of rosbag2), or the folder of
-            text tables of a known data set.
+        path: an MCAP file or object (``s3://bucket/key``), a ROS 1 bag, an SQLite file of rosbag2, or
+            the folder of a split recording (with or without the ``metadata.yaml`` of rosbag2).
         max_inflated: limit of the inflated size of all chunks of a file [bytes], by default a plausible one
             for its size; chunks beyond it are omitted and reported as a loss.
         is_one: whether the files of a folder are known to be parts of one recording; otherwise its
@@ -316,15 +314,9 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
 
 
 def list_files(folder: Path) -> list[Path]:
-    """The files of recordings in a folder, MCAP first, by name and number.
-
-    If there are none, the text tables of a known data set.
-    """
+    """The files of recordings in a folder, MCAP first, by name and number."""
     named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=split_number))
-    if files := [file for file in named if not file.is_dir()]:
-        return files
-
-    return list_tables(folder)
+    return [file for file in named if not file.is_dir()]
 
 
 def stem_of(file: Path) -> str:

@@ -22,9 +22,9 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from pipeline.core import guess_names
 from pipeline.logs import records as rec
+from pipeline.logs.bags import catalog_bag
 from pipeline.logs.catalog import Catalog, Cover, keep_within
 from pipeline.logs.compressed import COMPRESSED, open_inflated
-from pipeline.logs.other_formats import catalog_other
 from pipeline.logs.records import (
     LONGEST_HEAD,
     LONGEST_MAGIC,
@@ -193,12 +193,12 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
         max_inflated: limit of the total inflated size [bytes]; None for one plausible for its size.
 
     Raises:
-        LogError: ``not_mcap``; for a bag, ``log_unreadable``; for a text table, ``too_large``.
+        LogError: ``not_mcap``; for a bag, ``log_unreadable``.
     """
     head = source.read_at(0, LONGEST_MAGIC)
     is_mcap = head.startswith(rec.MAGIC)
-    if not is_mcap and (other := catalog_other(source, detect_container(head), max_inflated)) is not None:
-        return other
+    if not is_mcap and (container := detect_container(head)):
+        return catalog_bag(source, container, max_inflated)
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import Ints, group_by, map_in_order, name_first, usable_threads
+from pipeline.logs.bags import read_bag
 from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
@@ -33,7 +34,6 @@ from pipeline.logs.columns import (
 )
 from pipeline.logs.decode import take_rows
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
-from pipeline.logs.other_formats import read_other
 from pipeline.logs.part import count_fetched, hash_sources, open_source
 from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
@@ -367,7 +367,7 @@ def _read_part(
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
-        held = read_other(source, part.path, container, own, most)
+        held = read_bag(part.path, container, own, most)
         return (_gather_bag(part, payloads, losses) for payloads, losses in held)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:

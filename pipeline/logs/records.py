@@ -72,7 +72,6 @@ class ByteSource(Protocol):
 
 ROS1_BAG: Final = "ROS 1 bag"
 SQLITE_BAG: Final = "rosbag2 SQLite file"
-TEXT_TABLE: Final = "text table"
 _MAGICS: Final = {b"#ROSBAG V": ROS1_BAG, b"SQLite format 3\0": SQLITE_BAG}
 
 LONGEST_MAGIC: Final = max(map(len, _MAGICS))

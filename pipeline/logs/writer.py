@@ -322,20 +322,6 @@ class LogWriter:
         for rows, payloads in encode_rows(kind.structure, log.size, given, where=topic):
             self._waiting.append(_Rows(channel, log[rows], first + rows, payloads))
 
-    def write_before(self, log_time: int) -> None:
-        """Write the messages logged before a time and free their memory.
-
-        Messages added afterwards should be later: earlier ones are written too, but in a chunk that overlaps
-        the previous ones.
-
-        Args:
-            log_time: [ns].
-        """
-        waiting = self._waiting
-        self._write([rows.select(rows.log_time < log_time) for rows in waiting])
-        later = [rows.select(rows.log_time >= log_time) for rows in waiting]
-        self._waiting = [rows for rows in later if rows.log_time.size]
-
     def close(self) -> None:
         """Write all remaining messages and rename the file to its final name."""
         self._write(self._waiting)

@@ -9,23 +9,21 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.models.catalogue import (
-        distrust,
         draft_effect,
         explain_idle,
         find_effect,
         find_late_effect,
         is_own,
         list_effects,
+        list_own_effects,
         list_pages,
-        list_trusted,
+        load_effects,
         name_effect,
         name_number,
         name_parameter,
         name_term,
-        read_code,
         refuse_taken,
         suggest_manoeuvre,
-        trust,
     )
     from pipeline.models.effect import (
         ANY,
@@ -40,23 +38,9 @@ if TYPE_CHECKING:
     from pipeline.models.expression import Expression
     from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written, list_terms
     from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-    from pipeline.models.learned_term import (
-        INPUTS,
-        LEARNED,
-        LEAST_WAY_M,
-        Bands,
-        InputProbe,
-        LearnedInput,
-        ResidualTerm,
-        describe_learned,
-        drop_learned,
-        find_kind,
-        find_learned,
-        learned_as_table,
-    )
-    from pipeline.models.literature import MODELS, LiteratureModel, find_model, list_models
+    from pipeline.models.literature import LiteratureModel, find_model, list_literature, list_models
     from pipeline.models.model import ForwardModel, Model, Timing, replace_context
-    from pipeline.models.model_file import ModelFile, list_code, parse_model, read_model
+    from pipeline.models.model_file import ModelFile, parse_model, read_model
     from pipeline.models.model_text import (
         check_target,
         format_effect,

@@ -1,153 +1,39 @@
-"""Catalogue of effects: those of the folder `effects`, and those of files that a user names and trusts."""
+"""Catalogue of effects: those of the folder `effects`, and those of the user's own Python.
+
+Own effects come from files that the user names, and from installed packages, as entry points of the group
+`slip.effects`. A model file names effects, never code.
+"""
 
 import functools
 import hashlib
 import importlib
 import inspect
-import os
 import pkgutil
 import re
-import stat
 import sys
-import tempfile
-from collections.abc import Collection, Mapping, Sequence
-from importlib import resources
-from pathlib import Path, PurePosixPath
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import metadata, resources
+from pathlib import Path
 from types import ModuleType
 
-from pipeline.core import guess_names, suffix_unit
+from pipeline.core import guess_names, naming_os_errors, read_bounded, suffix_unit
 from pipeline.models.effect import Effect, Excitation, Late, Parameter, Search, find_late
 from pipeline.models.families import check_formula
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.parameter import is_of_one_run
 from pipeline.models.words import find_words
 from pipeline.run import MotionError
-
-# The user's own Python code is read once, and run only if exactly this content is trusted.
-#
-# Trust is a list of SHA-256 hashes in the user's configuration folder. The hashed bytes are run: they
-# are read once, and cached bytecode beside a file (`__pycache__`) is ignored.
-
-_LONGEST = 1_000_000
-"""Largest size of a file of effects [bytes]: a hundred times the longest of the catalogue."""
-_LINE = re.compile(r"([0-9a-f]{64})  (.*)")
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
-
-
-def read_code(folder: Path, name: str) -> bytes:
-    """Content of a Python file that a model file names.
-
-    Args:
-        folder: folder of the model file.
-        name: file name as written there.
-
-    Raises:
-        MotionError: ``effects_file``, it is in another folder, missing, not a regular file, or too long.
-    """
-    relative = PurePosixPath(name)
-    if relative.is_absolute() or not relative.name or ".." in relative.parts or "\\" in name or "\0" in name:
-        raise _bad_file(name, "a file of effects must lie beside the model file", "Write its name alone.")
-    try:
-        descriptor = os.open(folder / relative, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError):
-        raise _bad_file(name, "there is no such file of effects", "Check the path.") from None
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise _bad_file(name, "the file of effects is not a regular file", "Check the path.")
-    with os.fdopen(descriptor, "rb") as file:
-        content = file.read(_LONGEST + 1)
-    if len(content) > _LONGEST:
-        raise _bad_file(name, f"the file of effects is longer than {_LONGEST} bytes", "Split it.")
-    return content
-
-
-def hash_code(content: bytes) -> str:
-    """SHA-256 of code, in hexadecimal."""
-    return hashlib.sha256(content).hexdigest()
-
-
-def list_trusted() -> dict[str, str]:
-    """Trusted hashes with the names of their files; empty without a list.
-
-    Raises:
-        MotionError: ``trust_unsafe``, other users can write the list.
-    """
-    path = _list_path()
-    try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            content = file.read()
-    except (FileNotFoundError, NotADirectoryError):
-        return {}
-    except OSError as error:
-        raise _bad_list(path, f"cannot be read: {error.strerror}") from None
-    if status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE:
-        raise _bad_list(path, "is not yours alone to write, so nothing in it counts")
-    matches = map(_LINE.fullmatch, content.decode("utf-8", "replace").split("\n"))
-    return {match[1]: match[2] for match in matches if match}
-
-
-def trust(codes: dict[str, str]) -> None:
-    """Add code to the trusted code.
-
-    Args:
-        codes: names by hash.
-
-    Raises:
-        MotionError: ``trust_unsafe``.
-    """
-    _write({**list_trusted(), **codes})
-
-
-def distrust(hashes: set[str]) -> None:
-    """Remove code from the trusted code.
-
-    Raises:
-        MotionError: ``trust_unsafe``.
-    """
-    _write({code: name for code, name in list_trusted().items() if code not in hashes})
-
-
-def _write(codes: dict[str, str]) -> None:
-    path = _list_path()
-    plain = {code: "".join(c if c.isprintable() else "?" for c in name) for code, name in codes.items()}
-    text = "".join(f"{code}  {name}\n" for code, name in sorted(plain.items()))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        # The owner alone can access a temporary file, and this mode remains when it is renamed.
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(text.encode())
-        Path(temporary).replace(path)
-    except OSError as error:
-        raise _bad_list(path, f"cannot be written: {error.strerror}") from None
-
-
-def _list_path() -> Path:
-    """Path of the list in the user's configuration folder; a relative XDG_CONFIG_HOME is ignored."""
-    given = Path(os.environ.get("XDG_CONFIG_HOME", ""))
-    try:
-        base = given if given.is_absolute() else Path.home() / ".config"
-    except RuntimeError:
-        raise _bad_list(Path("~/.config"), "cannot be found: there is no home folder") from None
-    return base / "slip" / "trusted_code"
-
-
-def _bad_file(name: str, what: str, hint: str) -> MotionError:
-    return MotionError("effects_file", what, where=repr(name), hint=hint)
-
-
-def _bad_list(path: Path, what: str) -> MotionError:
-    hint = "Make it yours and writable by you alone (chmod 600), or set XDG_CONFIG_HOME to a folder of yours."
-    return MotionError("trust_unsafe", f"the list of trusted code {what}", where=str(path), hint=hint)
-
 
 EffectClass = type[Effect]
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
-_OWN = "slip_effects_"
+_GROUP = "slip.effects"
+"""Entry points by which an installed package brings effects: classes, or modules that hold them."""
+
+_own: dict[str, EffectClass] = {}
+"""Own effects of files that the user named, by id."""
 
 
 @functools.cache
@@ -165,25 +51,19 @@ def list_effects() -> tuple[EffectClass, ...]:
     return tuple(sorted(effects, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 
-def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> EffectClass:
-    """The effect of that id.
-
-    Args:
-        name: id of the effect.
-        own: effects of the user's own, by id; they take precedence.
+def find_effect(name: str) -> EffectClass:
+    """The effect of that id, of the catalogue or the user's own.
 
     Raises:
         MotionError: ``unknown_effect``, with the nearest ids.
     """
-    # A learned term is not in the folder, as it is never reported as a cause.
-    every: tuple[EffectClass, ...] = (*list_effects(), ResidualTerm)
-    known = {effect.id: effect for effect in every} | dict(own or {})
-    if name in known:
-        return known[name]
-    hint = f"{guess_names(name, known)}`slip effects` lists them all."
-    if name.endswith(".py"):
-        hint = f'Name its file above [vehicle] of the model file, effects = ["{name}"], and its id here.'
-    raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
+    known = {effect.id: effect for effect in list_effects()}
+    effect = known.get(name) or list_own_effects().get(name)
+    if effect is None:
+        near = guess_names(name, known)
+        hint = f"{near}`slip effects` lists them all; --effects FILE.py loads one of your own."
+        raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
+    return effect
 
 
 def name_effect(effect: str) -> str:
@@ -232,37 +112,65 @@ def find_late_effect(late: Late) -> EffectClass:
     return effect
 
 
-@functools.lru_cache(maxsize=64)
-def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
-    """Effects of the user's own Python code, by id. The code is run: the caller checks that it is trusted.
+def load_effects(paths: Iterable[Path]) -> None:
+    """Run the user's own Python files, whose effects models may have from now on.
 
     Args:
-        code: the code; the file itself is not read again.
-        path: path of the file.
+        paths: Python files; one with an id of an earlier file takes its place.
 
     Raises:
-        MotionError: ``effects_file``, the code fails or defines no effect.
+        MotionError: ``effects_file``, a file cannot be read, fails, or defines no effect; ``same_id``, one of
+            its effects has the id of one of the catalogue.
     """
-    module = ModuleType(f"{_OWN}{hash_code(code)}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module
+    for path in paths:
+        hint = "Check the path."
+        with naming_os_errors(MotionError, "effects_file", "cannot be read", where=path, hint=hint):
+            code = read_bounded(path)
+        module = ModuleType(f"slip_effects_{hashlib.sha256(code).hexdigest()}")
+        module.__file__ = str(path)
+        sys.modules[module.__name__] = module
+        with _naming_errors(str(path)):
+            exec(compile(code, str(path), "exec", dont_inherit=True), vars(module))  # noqa: S102 - the user's own
+        _own.update(_check_own(_effects_of(module), str(path)))
+
+
+@contextmanager
+def _naming_errors(where: str) -> Iterator[None]:
+    """Raise whatever the user's own Python raises as one line that says where."""
     try:
-        exec(compile(code, str(path), "exec", dont_inherit=True), vars(module))  # noqa: S102 - it is trusted
+        yield
     except Exception as error:
-        del sys.modules[module.__name__]
-        raise MotionError(
-            "effects_file",
-            f"the file of effects does not run: {type(error).__name__}: {' '.join(str(error).split())}",
-            where=str(path),
-            hint="Correct it; it must be importable Python.",
-        ) from error
-    effects = {effect.id: effect for effect in _effects_of(module)}
-    for effect in effects.values():
-        check_formula(effect)
+        what = f"the effects cannot be loaded: {type(error).__name__}: {' '.join(str(error).split())}"
+        hint = "Correct it; it must be importable Python."
+        raise MotionError("effects_file", what, where=where, hint=hint) from error
+
+
+def list_own_effects() -> dict[str, EffectClass]:
+    """The user's own effects by id: of installed packages, and of files that were loaded."""
+    return _list_installed() | _own
+
+
+@functools.cache
+def _list_installed() -> dict[str, EffectClass]:
+    effects: dict[str, EffectClass] = {}
+    for entry in metadata.entry_points(group=_GROUP):
+        with _naming_errors(f"{_GROUP}: {entry.name}"):
+            loaded = entry.load()
+        classes = _effects_of(loaded) if inspect.ismodule(loaded) else [loaded]
+        effects |= _check_own(classes, f"{_GROUP}: {entry.name}")
+    return effects
+
+
+def _check_own(effects: list[EffectClass], where: str) -> dict[str, EffectClass]:
     if not effects:
         hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
-        raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)
-    return effects
+        raise MotionError("effects_file", "it defines no effect", where=where, hint=hint)
+    for effect in effects:
+        if any(known.id == effect.id for known in list_effects()):
+            what, hint = f"an effect of the catalogue is called {effect.id!r}", "Choose another id."
+            raise MotionError("same_id", what, where=where, hint=hint)
+        check_formula(effect)
+    return {effect.id: effect for effect in effects}
 
 
 def draft_effect(path: Path) -> str:
@@ -286,7 +194,7 @@ def draft_effect(path: Path) -> str:
 
 def is_own(kind: EffectClass) -> bool:
     """Whether an effect comes from the user's own Python code."""
-    return kind.__module__.startswith(_OWN)
+    return not kind.__module__.startswith(f"{__package__}.")
 
 
 def _effects_of(module: ModuleType) -> list[EffectClass]:

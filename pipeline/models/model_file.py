@@ -2,25 +2,15 @@
 
 import math
 import re
-import shlex
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, shorten
-from pipeline.models.catalogue import (
-    EffectClass,
-    find_effect,
-    hash_code,
-    list_trusted,
-    read_code,
-    refuse_taken,
-    run_effects,
-)
+from pipeline.models.catalogue import find_effect, refuse_taken
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-from pipeline.models.learned_term import parse_learned
 from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run import MotionError
@@ -36,10 +26,9 @@ from pipeline.sources import (
 
 FORMAT = 1
 """Version of the format of model files; other versions are rejected."""
-_SECTIONS = ("format", "effects", "vehicle", "effect", "learned", "fit", "note")
+_SECTIONS = ("format", "vehicle", "effect", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
 _ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."
-_CODE = re.compile(r"effects\s*=.*\.py[\"']")
 _ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
 Table = dict[str, object]
@@ -57,27 +46,17 @@ class ModelFile:
 
     Attributes:
         model: vehicle and effects with their values.
-        effect_files: files of the user's own effects, as written.
         per_run: labels ``effect.name`` whose values are estimated per run.
         intervals: 95 % intervals of the last fit by label.
         fit: record of the last fit: input, runs with hashes, delays, ladder; empty before the first fit.
         note: free text.
-        own: effects of the user's own Python, by id.
-        code: hashes of the Python code that was run for them.
-        omitted: ids of effects defined only in Python code that is not trusted.
-        warnings: omitted parts with the reason, one line each.
     """
 
     model: Model
-    effect_files: tuple[str, ...] = ()
     per_run: tuple[str, ...] = ()
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     fit: Mapping[str, object] = field(default_factory=dict)
     note: str = ""
-    own: Mapping[str, EffectClass] = field(default_factory=dict, compare=False)
-    code: tuple[str, ...] = field(default=(), compare=False)
-    omitted: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
     @property
     def last_input(self) -> str | None:
@@ -152,11 +131,9 @@ class ModelFile:
 def read_model(path: Path) -> ModelFile:
     """Read a model file.
 
-    Python code that it names is run only if its content is trusted (`trust`); effects defined only in
-    untrusted code are omitted, with a warning in the result.
-
     Raises:
-        MotionError: the file is missing, is not TOML or is not valid; with the line.
+        MotionError: the file is missing, is not TOML or is not valid, or has an effect of the user's own that
+            is not loaded (`load_effects`); with the line.
     """
     return parse_model(read_text(path), path)
 
@@ -192,23 +169,9 @@ def parse_model(text: str, path: Path) -> ModelFile:
 
     Args:
         text: TOML.
-        path: path of the file; files of effects are in the same folder.
+        path: path of the file, for errors.
     """
     return _Reader(text, path).read()
-
-
-def list_code(path: Path) -> dict[str, str]:
-    """The user's own Python code that a file refers to, names by hash; none of it is run.
-
-    Args:
-        path: a model file, or a Python file itself.
-
-    Raises:
-        MotionError: a file is missing or cannot be read.
-    """
-    if path.suffix == ".py":
-        return {hash_code(read_code(path.parent, path.name)): path.name}
-    return {hash_code(read_code(path.parent, name)): name for name in _Reader(read_text(path), path).files}
 
 
 class _Reader:
@@ -224,10 +187,6 @@ class _Reader:
             raise MotionError(
                 "model_not_toml", error.what, where=str(where), hint="Correct that line."
             ) from None
-        self.own: dict[str, EffectClass] = {}
-        self.code: list[str] = []
-        self.untrusted: list[str] = []
-        self.omitted: list[str] = []
         self.per_run: list[str] = []
         self.intervals: dict[str, tuple[float, float]] = {}
 
@@ -243,26 +202,14 @@ class _Reader:
                 f"This version reads format {FORMAT}.",
             )
             raise self._error(what, hint, None, "format", code="model_too_new")
-        is_inside = False
-        for number, line in enumerate(self.lines, start=1):
-            is_inside |= line.startswith("[")
-            if is_inside and _CODE.match(line):
-                what, where = "files of effects are named inside a table", f"{self.path}:{number}"
-                raise MotionError("model_invalid", what, where=where, hint=_ABOVE)
-        self._load_own()
         vehicle = self._vehicle()
         fit = self.tree.get("fit", {})
         return ModelFile(
             model=Model(vehicle, tuple(self._list_effects(vehicle))),
-            effect_files=self.files,
             per_run=tuple(self.per_run),
             intervals=self.intervals,
             fit=fit if isinstance(fit, dict) else {},
             note=str(self.tree.get("note", "")),
-            own=self.own,
-            code=tuple(self.code),
-            omitted=tuple(self.omitted),
-            warnings=self._warn(),
         )
 
     def _list_effects(self, vehicle: Vehicle) -> list[Effect]:
@@ -271,37 +218,12 @@ class _Reader:
             raise self._error("effects are written as [[effect]]", "Double the brackets.", None, "effect")
         effects: list[Effect] = []
         for number, table in enumerate(tables):
-            effect = self._effect(number, table)
-            if effect is not None:
-                effects.append(effect)
-                try:
-                    Model(vehicle, tuple(effects))
-                except MotionError as error:
-                    raise self._repeat(error, ("effect", number), "id") from error
-        if "learned" in self.tree:
-            effects.append(parse_learned(self.tree["learned"], self._locate(None, "learned")))
-        return effects
-
-    def _load_own(self) -> None:
-        trusted = list_trusted() if self.files else {}
-        for name in self.files:
+            effects.append(self._effect(number, table))
             try:
-                content = read_code(self.path.parent, name)
-                if hash_code(content) in trusted:
-                    self.own |= run_effects(content, self.path.parent / name)
-                    self.code.append(hash_code(content))
-                else:
-                    self.untrusted.append(name)
+                Model(vehicle, tuple(effects))
             except MotionError as error:
-                raise self._repeat(error, None, "effects", f"{name!r}: ") from error
-
-    def _warn(self) -> tuple[str, ...]:
-        if not self.untrusted:
-            return ()
-        files = ", ".join(map(repr, self.untrusted))
-        missing = f"; left out: {', '.join(self.omitted)}" if self.omitted else ""
-        how = f"Read it, then trust it: slip model trust {shlex.quote(str(self.path))}"
-        return (f"{self.path}: Python that is not trusted is not run: {files}{missing}. {how}",)
+                raise self._repeat(error, ("effect", number), "id") from error
+        return effects
 
     def _vehicle(self) -> Vehicle:
         table = self.tree.get("vehicle")
@@ -324,7 +246,7 @@ class _Reader:
         except ConfigurationError as error:
             raise self._repeat(error, ("vehicle", 0), "preset") from None
 
-    def _effect(self, number: int, table: Table) -> Effect | None:
+    def _effect(self, number: int, table: Table) -> Effect:
         at = ("effect", number)
         name = table.get("id")
         if not isinstance(name, str) or not name:
@@ -345,11 +267,8 @@ class _Reader:
             texts = {channel: str(text) for channel, text in formulas.items()}
             return self._formula(at, name, texts, numbers, values, fixed)
         try:
-            effect = find_effect(name, self.own)
+            effect = find_effect(name)
         except MotionError as error:
-            if self.untrusted:
-                self.omitted.append(name)
-                return None
             raise self._repeat(error, at, "id") from error
         for key, said in numbers.items():
             self._check_parameter(at, effect(), key, said, values.get(key))
@@ -438,14 +357,6 @@ class _Reader:
         if value is not None and not _is_number(value):
             raise self._error(f"the value of {label} is not a number", "Write value = 1.5.", at, key)
         return (None if value is None else float(value)), bool(raw.get("fixed", False))
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Python files that the model names."""
-        value = self.tree.get("effects", [])
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise self._error("effects is a list of file names", 'Write effects = ["a.py"].', None, "effects")
-        return tuple(value)
 
     def _error(
         self, what: str, hint: str, at: tuple[str, int] | None, key: str, *, code: str = "model_invalid"

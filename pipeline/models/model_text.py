@@ -14,23 +14,17 @@ from pipeline.models.effect import (
     Parameter,
 )
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.learned_term import LEARNED, find_learned, learned_as_table
 from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.run import MotionError
 from pipeline.sources import FLEET_FILE, RANGES, RUN_FILE, Vehicle, find_preset, is_model
 from pipeline.store import replace_file
-
-_LEARNED_HEAD = (
-    "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
-    "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",
-)
 
 
 def write_model(file: ModelFile, path: Path) -> None:
     """Write a model file atomically: a reader sees the old one or the new one.
 
     Raises:
-        MotionError: ``model_unwritable``; ``model_misplaced``; ``model_incomplete``, see `format_model`.
+        MotionError: ``model_unwritable``; ``model_misplaced``.
     """
     check_target(path)
     write_text(path, format_model(file), code="model_unwritable")
@@ -63,15 +57,7 @@ def write_text(path: Path, text: str, *, code: str) -> None:
 
 
 def format_model(file: ModelFile) -> str:
-    """The text of a model file.
-
-    Raises:
-        MotionError: ``model_incomplete``, effects that were omitted when it was read would be lost.
-    """
-    if file.omitted:
-        what = f"{', '.join(file.omitted)} would be lost: {', '.join(file.effect_files)} is not trusted"
-        hint = "Read it and trust it (slip model trust), or take its effects out of the file by hand."
-        raise MotionError("model_incomplete", what, where=", ".join(file.omitted), hint=hint)
+    """The text of a model file."""
     lines = [
         "# A motion model: a vehicle, and the physical effects by which it differs from the ideal one.",
         "# `slip effects ID` explains an effect; `slip model show` this file.",
@@ -79,15 +65,9 @@ def format_model(file: ModelFile) -> str:
     ]
     if file.note:
         lines.append(f"note = {format_value(file.note)}")
-    if file.effect_files:
-        lines.append(f"effects = [{', '.join(format_value(name) for name in file.effect_files)}]")
     lines += ["", *_format_vehicle(file.model.vehicle)]
     for effect in file.model:
-        if effect.id == LEARNED:
-            continue
         lines += ["", *_list_lines(effect, file)]
-    if (term := find_learned(file.model)) is not None:
-        lines += ["", *_LEARNED_HEAD, *_format_table("learned", learned_as_table(term))]
     if file.fit:
         lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
     return "\n".join(lines) + "\n"

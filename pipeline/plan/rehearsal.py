@@ -11,7 +11,6 @@ import numpy as np
 
 from pipeline.core import Complex, Flags, Floats
 from pipeline.estimation import EstimationData, Input, ModelState, RunResiduals, fit_model
-from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.decision import list_costs
 from pipeline.estimation.fit import PathFit
 from pipeline.estimation.largest import average_sustained, measure_largest
@@ -379,7 +378,7 @@ def learn(
     data = EstimationData(used, vehicle, Input.COMMAND)
     model = Model(data.vehicle, tuple(effects))
     if prior:
-        data = tie_to_prior(data, prior)
+        data = data.with_prior(prior)
     fitted = fit_model(data, model)
     noise = [_measure_noise(fit) for fit in fitted.fits]
     return Knowledge(data.vehicle, read_senses(used), _inform(fitted), np.array(noise), data, fitted)

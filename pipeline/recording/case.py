@@ -103,7 +103,7 @@ class Case:
         self.is_known = given.is_known
         self.sources, self.configuration, self.vehicle = given.sources, given.configuration, given.vehicle
         # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
-        equal = replace(self.sources, others={**self.sources.others, "command": ()}, power=None)
+        equal = replace(self.sources, others={**self.sources.others, "command": ()})
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
         self.extraction = Extraction(replace(given, sources=equal))

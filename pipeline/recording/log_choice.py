@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +30,6 @@ from pipeline.logs import (
     TopicColumns,
     TransformBuffer,
     Wanted,
-    list_fields,
     read_topics,
     wanted_transforms,
 )
@@ -74,7 +72,6 @@ if TYPE_CHECKING:
     from pipeline.recording.geometry import Geometry
     from pipeline.stages import PoseRating
 
-_INDEX = re.compile(r"\[\d+\]$")
 _EVENTS = "rcl_interfaces/ParameterEvent"
 _LISTS = ("new_parameters", "changed_parameters")
 _VALUE = "value.double_value"
@@ -311,7 +308,7 @@ def _choose_readable(
     if sources.command is None and sources.wheels is not None and sources.pose is not None:
         text = "the log contains no commands: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
-    chosen = Choice(vehicle, source, _leave_out_power(index, sources), findings=tuple(findings))
+    chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     chosen = _choose_pose(chosen, channels, index, configuration)
     # The content may leave no drive: what was chosen by name is a drive all the same.
     pose = chosen.sources.pose
@@ -383,7 +380,7 @@ def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configu
 
 MOST_POSES = 40
 """Maximum number of poses whose content is compared: each costs a reading of the drive's topics, too, and the
-platforms of `pipeline/simulate/platforms` record at most ten."""
+platforms of `tests/fixtures/platforms` record at most ten."""
 
 
 def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[list[PoseSource], Finding]:
@@ -487,20 +484,6 @@ def _leave_out_silent(
     channels = [channel for channel in channels if channel.topic not in unread]
     sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
     return channels, sources, [Finding("no_readable_text", "warning", text, where=silent[0])]
-
-
-def _leave_out_power(index: LogIndex, sources: Sources) -> Sources:
-    """The sources without electric readings that this version of their type does not have."""
-    power = sources.power
-    if power is None:
-        return sources
-    there = list_fields(index)
-    currents, voltages = (
-        tuple(one for one in signals if _INDEX.sub("", one.fields()[0]) in there.get(one.topic, ()))
-        for signals in (power.currents, power.voltages)
-    )
-    readable = replace(power, currents=currents, voltages=voltages) if currents else None
-    return replace(sources, power=readable)
 
 
 def _is_text(index: LogIndex, command: DriveSource) -> bool:

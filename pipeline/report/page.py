@@ -218,9 +218,6 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
         steps.append(("Export it to the controller", suggest_export(kind, "model.toml")))
         against = f"slip model compare model.toml --against literature --on {name}"
         steps.append(("Compare it with models of the literature", against))
-        if diagnosis.learned is not None and diagnosis.learned.helps:
-            learn = f"slip model add model.toml learned_term --on {name}"
-            steps.append(("Put a learned term on top of it", learn))
     if diagnosis.undecided or diagnosis.unobservable_why:
         what = "is undecided" if diagnosis.undecided else "is not observable"
         steps += [

@@ -28,7 +28,6 @@ from pipeline.words import (
     describe_motion,
     describe_rest,
     describe_unexplained,
-    format_learned_share,
     format_remaining_error,
     format_short,
     format_suggestion,
@@ -305,8 +304,6 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         texts = [describe_unexplained(rest), *terms, format_suggestion(rest)]
         # A formula that is too long for a line is nothing that anybody reads.
         yield "unexplained", "; ".join(filter(None, texts)), (rest.formula or "") if terms else ""
-    if beyond := format_learned_share(diagnosis):
-        yield "beyond the effects", beyond, ""
     if diagnosis.unobservable_why:
         yield "not observable in this log", ", ".join(map(name_term, diagnosis.unobservable_why)), ""
     known = {str(entry.get("text", "")) for entry in list_findings(report)}

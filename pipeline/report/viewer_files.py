@@ -1,404 +1,145 @@
-"""Files for viewers and spreadsheets: a log of derived topics, layouts, tables as CSV."""
+"""Files of a run for viewers and spreadsheets: a log of slip topics, layouts that show it, and tables."""
 
-import json
 import shutil
-import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 import polars as pl
+import polars.selectors as cs
 
-from pipeline.core import INPUT_WORDS, Floats, Ints, format_csv
-from pipeline.estimation import Prediction
+from pipeline.core import Floats, Ints, quote_formulas
 from pipeline.logs.writer import Given, LogWriter
-from pipeline.report import theme, writing_export
-from pipeline.report.export_source import (
-    FINDING_MARKERS,
-    FINDINGS,
-    IDEAL_POSE,
-    MEASURED,
-    MODEL,
-    MODEL_POSE,
-    PATH,
-    POSE,
-    PREDICTED_PATH,
-    RESIDUAL,
-    SEGMENT,
-    TRAIL,
-    ExportSource,
-    ModelFeed,
-    join_track,
-    name_ideal,
-    name_modulus,
-    name_slip,
-    write_findings,
-    write_trail,
-)
-from pipeline.stages import find_residual_modulus
-from pipeline.store import read_length_scale, replace_file, temporary_beside
+from pipeline.report import writing_export
+from pipeline.store import Manifest, check_size, name_damage, replace_file, temporary_beside
 from schemas import contract_of
 
-_BODY = "base_link"
-_TWIST = "geometry_msgs/msg/TwistStamped"
+_AGREE_NS = 1_000_000_000
+"""Largest offset of two clocks that agree [ns]: it is the latency of the messages."""
 _PATH_POSES = 5000
-_PREDICTIONS_HZ = 5.0
-_FOLLOWED_S = 1.7
-"""Time [s] that a prediction is followed: the next may begin 0.3 s before it ends, where poses are rare."""
-_VELOCITIES = ("t", "stamp", "segment", "x", "y", "z", "yaw", "v_x", "v_y", "v_w")
-_SLIP = ("stamp", "f_x", "f_y", "f_w", "g_x", "g_y", "g_w", "modulus")
+"""Poses of the whole path: those that a screen can show."""
+_LEVELS = {"info": 20, "warning": 30, "error": 40}
+_TWIST, _POSE = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/PoseStamped"
+_NUMBER = "std_msgs/msg/Float64"
+LAYOUTS = {"foxglove-layout": "foxglove.json", "plotjuggler-layout": "plotjuggler.xml"}
+"""Layouts of viewers, as files of the folder `layouts`."""
 
 
-def write_derived_log(source: ExportSource, path: Path) -> Path:
-    """Write velocities, slip, segments, findings and paths of a run as MCAP.
+def write_slip_log(manifest: Manifest, slip: pl.DataFrame, path: Path, frame_id: str = "map") -> Path:
+    """Write velocities, slip, poses, segments and findings of a run as MCAP.
+
+    Topics are `/slip/pose`, `/slip/path`, `/slip/segment`, `/slip/findings` and `/slip/velocity/measured`; of
+    each input `/slip/velocity/ideal_INPUT`, `/slip/slip_INPUT`, `/slip/modulus_INPUT`; and of a model
+    `/slip/velocity/model_INPUT` and `/slip/residual_modulus_INPUT`.
 
     Args:
-        source: the run, with the model whose velocity and predictions are exported.
+        manifest: the run.
+        slip: its table `slip`, with the columns of the model to show.
         path: the file; an existing one is replaced when the new one is complete.
+        frame_id: fixed frame of the poses.
 
     Raises:
         LogError: the path cannot be written.
-        MotionError: the model cannot be run on this log.
     """
+    velocities, shift_ns = manifest.read("velocities"), _find_shift(manifest)
+
+    def write(topic: str, kind: str, stamps: Ints, fields: dict[str, Given], frame: str = "") -> None:
+        stamped = {"header.frame_id": frame, **fields} if frame else fields
+        header = stamps if frame else None
+        writer.write_columns(topic, kind, stamps + shift_ns, stamped, header_time=header)
+
+    def write_velocity(topic: str, rows: pl.DataFrame, prefix: str) -> None:
+        names = {"linear.x": "x", "linear.y": "y", "angular.z": "w"}
+        fields = {f"twist.{field}": rows[f"{prefix}_{axis}"].to_numpy() for field, axis in names.items()}
+        write(topic, _TWIST, rows["stamp"].to_numpy(), dict(fields), "base_link")
+
+    def write_number(topic: str, rows: pl.DataFrame, name: str) -> None:
+        write(topic, _NUMBER, rows["stamp"].to_numpy(), {"data": rows[name].to_numpy()})
+
+    log = manifest.part("log")
     with LogWriter(path) as writer:
-        writer.metadata("slip", {"run": source.manifest.run, "key": source.manifest.key, **_name_log(source)})
-        track = join_track(source)
-        _write_path(writer, source)
-        write_trail(writer, source, track)
-        write_findings(writer, source, track)
-        velocities = source.feed("velocities", "stamp", _VELOCITIES)
-        slip = {name: source.feed("slip", "stamp", _SLIP, name) for name in source.inputs}
-        model = None if source.model is None else ModelFeed(source, source.model)
-        ideal = None if source.model is None else ModelFeed(source, source.model.ideal)
-        for low, high in source.stretches:
-            frame = velocities.take(low, high)
-            if frame is not None:
-                _write_velocities(writer, source, frame)
-            for name, feed in slip.items():
-                rows = feed.take(low, high)
-                if rows is not None:
-                    _write_slip(writer, source, name, rows)
-            if model is not None and frame is not None:
-                _write_model(writer, source, model, frame, (low, high))
-            if ideal is not None and frame is not None:
-                _write_ideal(writer, source, ideal, (low, high))
-            writer.write_before(high + source.shift_ns)
-        if model is not None:
-            model.check()
+        named = {"log": str(log.get("path", "")), "sha256": str(log.get("sha256", ""))}
+        writer.metadata("slip", {"run": manifest.run, "key": manifest.key, **named})
+        stamps = velocities["stamp"].to_numpy()
+        # Not odometry: its two covariances, which are unknown, would be four fifths of the file.
+        write("/slip/pose", _POSE, stamps, dict(_fill_poses(velocities, "pose.")), frame_id)
+        write("/slip/segment", "std_msgs/msg/Int32", stamps, {"data": velocities["segment"].to_numpy()})
+        write_velocity("/slip/velocity/measured", velocities, "v")
+        thinned = velocities.gather_every(max(velocities.height // _PATH_POSES, 1))
+        whole = {field: values[None, :] for field, values in _fill_poses(thinned, "poses[].pose.").items()}
+        if velocities.height:
+            write("/slip/path", "nav_msgs/msg/Path", stamps[:1], dict(whole), frame_id)
+        for (name,), rows in slip.group_by(pl.col("input").cast(pl.String), maintain_order=True):
+            write_velocity(f"/slip/velocity/ideal_{name}", rows, "f")
+            write_velocity(f"/slip/slip_{name}", rows, "g")
+            write_number(f"/slip/modulus_{name}", rows, "modulus")
+            known = rows.drop_nulls("residual_modulus")
+            if not known.is_empty():
+                write_velocity(f"/slip/velocity/model_{name}", known, "model")
+                write_number(f"/slip/residual_modulus_{name}", known, "residual_modulus")
+        _write_findings(writer, manifest, velocities, shift_ns)
     return path
 
 
-def _name_log(source: ExportSource) -> dict[str, str]:
-    log = source.manifest.part("log")
-    return {key: str(log.get(name, "")) for key, name in (("log", "path"), ("sha256", "sha256")) if log}
+def _find_shift(manifest: Manifest) -> int:
+    """Offset from stamps to the recorder's clock [ns]; zero where both agree to a second."""
+    poses = manifest.read("poses")
+    late = float((poses["log_time"] - poses["stamp"]).median() or 0.0) if poses.height else 0.0  # type: ignore[arg-type]
+    return 0 if abs(late) < _AGREE_NS else int(late)
 
 
-def _write_twist(
-    writer: LogWriter, source: ExportSource, topic: str, frame: pl.DataFrame, prefix: str
-) -> None:
-    fields: dict[str, Given] = {
-        "header.frame_id": _BODY,
-        "twist.linear.x": frame[f"{prefix}_x"].to_numpy(),
-        "twist.linear.y": frame[f"{prefix}_y"].to_numpy(),
-        "twist.angular.z": frame[f"{prefix}_w"].to_numpy(),
-    }
-    source.write_stamped(writer, topic, _TWIST, frame["stamp"].to_numpy(), fields)
+def _fill_poses(rows: pl.DataFrame, prefix: str) -> dict[str, Floats]:
+    half = 0.5 * rows["yaw"].to_numpy()
+    turn = {f"{prefix}orientation.z": np.sin(half), f"{prefix}orientation.w": np.cos(half)}
+    return {f"{prefix}position.{axis}": rows[axis].to_numpy() for axis in "xyz"} | turn
 
 
-def _write_velocities(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
-    _write_twist(writer, source, MEASURED, frame, "v")
-    _write_poses(writer, source, frame)
-    times = source.log_times(frame["stamp"].to_numpy())
-    writer.write_columns(SEGMENT, "std_msgs/msg/Int32", times, {"data": frame["segment"].to_numpy()})
-
-
-def _write_slip(writer: LogWriter, source: ExportSource, name: str, rows: pl.DataFrame) -> None:
-    _write_twist(writer, source, name_ideal(name), rows, "f")
-    _write_twist(writer, source, name_slip(name), rows, "g")
-    times = source.log_times(rows["stamp"].to_numpy())
-    modulus = {"data": rows["modulus"].to_numpy()}
-    writer.write_columns(name_modulus(name), "std_msgs/msg/Float64", times, modulus)
-
-
-def _write_model(
-    writer: LogWriter, source: ExportSource, model: ModelFeed, frame: pl.DataFrame, stretch: tuple[int, int]
-) -> None:
-    low, high = (1e-9 * (edge - source.start_ns) for edge in stretch)
-    predicted = model.predict(low, high, frame["t"].to_numpy())
-    if predicted is None:
-        return
-    columns = {f"v_{axis}": predicted.velocity[:, i] for i, axis in enumerate("xyw")}
-    velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
-    _write_twist(writer, source, MODEL, velocity, "v")
-    modulus = find_residual_modulus(predicted.velocity, frame, length=read_length_scale(source.manifest))
-    known = np.isfinite(modulus)
-    times = source.log_times(frame["stamp"].to_numpy()[known])
-    writer.write_columns(RESIDUAL, "std_msgs/msg/Float64", times, {"data": modulus[known]})
-    _write_predictions(writer, source, predicted.prediction)
-    _write_predicted_poses(writer, source, MODEL_POSE, predicted.prediction)
-
-
-def _write_ideal(writer: LogWriter, source: ExportSource, ideal: ModelFeed, stretch: tuple[int, int]) -> None:
-    low, high = (1e-9 * (edge - source.start_ns) for edge in stretch)
-    predicted = ideal.predict(low, high, np.zeros(0))
-    if predicted is not None:
-        _write_predicted_poses(writer, source, IDEAL_POSE, predicted.prediction)
-
-
-def _write_predicted_poses(
-    writer: LogWriter, source: ExportSource, topic: str, prediction: Prediction
-) -> None:
-    """Write the poses of consecutive predictions, which begin at measured poses."""
-    times = prediction.start_times[:, None] + prediction.horizon_times[None, :]
-    rows = np.broadcast_to(prediction.horizon_times < _FOLLOWED_S, times.shape)
-    stamps = source.stamp(times[rows])
-    x, y, yaw = prediction.poses[rows].T
-    fields: dict[str, Given] = {
-        "pose.position.x": x,
-        "pose.position.y": y,
-        **_turn(yaw, "pose.orientation."),
-    }
-    source.write_stamped(writer, topic, "geometry_msgs/msg/PoseStamped", stamps, fields)
-
-
-def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
-    # Not odometry: its two covariances, which are unknown, would be four fifths of the file.
-    fields: dict[str, Given] = {
-        **{f"pose.position.{axis}": frame[axis].to_numpy() for axis in "xyz"},
-        **_turn(frame["yaw"].to_numpy(), "pose.orientation."),
-    }
-    stamps = frame["stamp"].to_numpy()
-    source.write_stamped(writer, POSE, "geometry_msgs/msg/PoseStamped", stamps, fields)
-
-
-def _write_path(writer: LogWriter, source: ExportSource) -> None:
-    """Write the complete path as one message at its beginning, thinned to screen resolution."""
-    rows = source.thin_velocities(("stamp", "x", "y", "z", "yaw"), _PATH_POSES)
+def _write_findings(writer: LogWriter, manifest: Manifest, velocities: pl.DataFrame, shift_ns: int) -> None:
+    """Write each finding as a line of a log panel, one that has no time at the start."""
+    rows = manifest.read("findings").sort(pl.col("t_start").fill_null(0.0), maintain_order=True)
     if rows.is_empty():
         return
-    whole = {name: column.to_numpy()[None, :] for name, column in rows.to_dict().items()}
-    stamps, yaw = whole.pop("stamp"), whole.pop("yaw")
-    _write_poses_along(writer, source, PATH, stamps, whole, yaw)
-
-
-def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Prediction) -> None:
-    """Write predicted paths of the model over two seconds from measured poses, a few per second."""
-    if prediction.start_times.size == 0:
-        return
-    slot = np.floor(prediction.start_times * _PREDICTIONS_HZ)
-    rows = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
-    stamps = source.stamp(prediction.start_times[rows])
-    along = stamps[:, None] + np.round(prediction.horizon_times * 1e9).astype(np.int64)[None, :]
-    x, y, yaw = np.moveaxis(prediction.poses[rows], 2, 0)
-    _write_poses_along(writer, source, PREDICTED_PATH, along, {"x": x, "y": y}, yaw)
-
-
-def _write_poses_along(
-    writer: LogWriter,
-    source: ExportSource,
-    name: str,
-    stamps: Ints,
-    positions: Mapping[str, Floats],
-    yaw: Floats,
-) -> None:
-    """Write paths, one per row, each at the stamp of its first pose.
-
-    Args:
-        writer: writer of the derived log.
-        source: the run.
-        name: topic of the paths.
-        stamps: stamps of the poses [ns], shape (n, k).
-        positions: by axis [m], shape (n, k) each.
-        yaw: [rad], shape (n, k).
-    """
-    fields: dict[str, Given] = {
-        "poses[].header.frame_id": [[source.frame_id] * stamps.shape[1]] * stamps.shape[0],
-        "poses[].header.stamp.sec": stamps // 10**9,
-        "poses[].header.stamp.nanosec": stamps % 10**9,
-        **{f"poses[].pose.position.{axis}": values for axis, values in positions.items()},
-        **_turn(yaw, "poses[].pose.orientation."),
-    }
-    source.write_stamped(writer, name, "nav_msgs/msg/Path", stamps[:, 0], fields)
-
-
-def _turn(yaw: Floats, prefix: str) -> dict[str, Floats]:
-    return {f"{prefix}z": np.sin(0.5 * yaw), f"{prefix}w": np.cos(0.5 * yaw)}
-
-
-_CLOSEST_M = 10.0
-_FIELDS = {"x": "linear.x", "y": "linear.y", "w": "angular.z"}
-
-
-@dataclass(frozen=True)
-class VelocityLine:
-    """Velocity in the derived log.
-
-    Attributes:
-        topic: topic of type TwistStamped.
-        label: label in the legend.
-        colour: colour as in the report.
-    """
-
-    topic: str
-    label: str
-    colour: str
-
-    def path(self, axis: str, separator: str = ".") -> str:
-        """Message path of the component `x`, `y` or `w`."""
-        return f"{self.topic}{separator}twist{separator}{_FIELDS[axis].replace('.', separator)}"
-
-
-def list_series(source: ExportSource) -> list[VelocityLine]:
-    """Velocities: measured, ideal on every input, and that of the model if there is one."""
-    lines = [VelocityLine(MEASURED, "measured", theme.MEASURED)]
-    lines += [
-        VelocityLine(name_ideal(name), f"ideal {INPUT_WORDS[name]}", theme.INPUT_COLOURS[name])
-        for name in source.inputs
-    ]
-    if source.model is not None:
-        lines.append(VelocityLine(MODEL, "model", theme.MODEL))
-    return lines
-
-
-def write_foxglove_layout(source: ExportSource, path: Path) -> Path:
-    """Write a layout file that shows the derived log beside the original.
-
-    Raises:
-        ReportError: ``export_not_written``.
-    """
-    return write_text(path, json.dumps(_build_panels(source), indent=1) + "\n")
-
-
-def _build_panels(source: ExportSource) -> dict[str, object]:
-    inputs = source.inputs
-    panels: dict[str, object] = {
-        "3D!map": _build_map(source),
-        "RosOut!findings": {"searchTerms": [], "minLogLevel": 1, "topicToRender": FINDINGS},
-        "Plot!slip": _build_plot(
-            "slip modulus [m/s]",
-            [
-                *(
-                    (f"{name_modulus(name)}.data", INPUT_WORDS[name], theme.INPUT_COLOURS[name])
-                    for name in inputs
-                ),
-                *([] if source.model is None else [(f"{RESIDUAL}.data", "with the model", theme.MODEL)]),
-            ],
-        ),
-    }
-    for axis, title in (("x", "v_x [m/s]"), ("y", "v_y [m/s]"), ("w", "v_w [rad/s]")):
-        lines = [(line.path(axis), line.label, line.colour) for line in list_series(source)]
-        panels[f"Plot!{axis}"] = _build_plot(title, lines)
-    return {"configById": panels, **_read_constants()["layout"]}
-
-
-def _read_constants() -> dict[str, dict[str, Any]]:
-    """Common parts of every layout: line, plot, map and whole; nulls are filled in."""
-    text = resources.files("pipeline.report").joinpath("foxglove.json").read_text("utf-8")
-    constants: dict[str, dict[str, Any]] = json.loads(text)
-    return constants
-
-
-def _build_map(source: ExportSource) -> dict[str, object]:
-    lines = {
-        PATH: {"visible": False, "lineWidth": 0.05, "gradient": [theme.QUIET, theme.QUIET]},
-        TRAIL: {"visible": True},
-        PREDICTED_PATH: {
-            "visible": True,
-            "lineWidth": 0.1,
-            "gradient": [theme.MODEL, theme.MODEL],
-        },
-        FINDING_MARKERS: {"visible": True},
-        POSE: {"visible": True},
-        **({} if source.model is None else {MODEL_POSE: {"visible": True}, IDEAL_POSE: {"visible": True}}),
-    }
-    middle, extent = _find_extent(source)
-    panel = _read_constants()["map"]
-    # From above, north up, with the complete path in view.
-    panel["cameraState"] |= {"distance": max(_CLOSEST_M, 1.2 * extent), "targetOffset": [*middle, 0]}
-    panel["layers"]["grid"]["color"] = theme.GRID
-    return panel | {"followTf": source.frame_id, "topics": lines}
-
-
-def _find_extent(source: ExportSource) -> tuple[list[float], float]:
-    """Centre of the path, x and y [m], and the longer side of its bounding box [m]."""
-    parts = [frame.to_numpy() for frame in source.batches("velocities", ("x", "y"))]
-    if not parts:
-        return [0.0, 0.0], 0.0
-    low = np.min([part.min(axis=0) for part in parts], axis=0)
-    high = np.max([part.max(axis=0) for part in parts], axis=0)
-    return [round(float(value), 2) for value in (low + high) / 2.0], float((high - low).max())
-
-
-def _build_plot(title: str, lines: list[tuple[str, str, str]]) -> dict[str, object]:
-    constants = _read_constants()
-    paths = [
-        {"value": value, "label": label, "color": colour, **constants["line"]}
-        for value, label, colour in lines
-    ]
-    return {"title": title, "paths": paths, **constants["plot"]}
-
-
-def write_plotjuggler_layout(source: ExportSource, path: Path) -> Path:
-    """Write a layout file for `plotjuggler --datafile run_slip.mcap --layout run_plotjuggler.xml`.
-
-    A layout refers to data that is already loaded, so the log comes first.
-
-    Raises:
-        ReportError: ``export_not_written``.
-    """
-    tree = _build_tabs(source)
-    ET.indent(tree)
-    return write_text(path, '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(tree, "unicode") + "\n")
-
-
-def _build_tabs(source: ExportSource) -> ET.Element:
-    root = ET.Element("root")
-    window = ET.SubElement(root, "tabbed_widget", {"parent": "main_window", "name": "Main Window"})
-    tab = ET.SubElement(window, "Tab", {"containers": "1", "tab_name": "slip"})
-    container = ET.SubElement(tab, "Container")
-    slip = [(f"{name_modulus(name)}/data", theme.INPUT_COLOURS[name]) for name in source.inputs]
-    slip += [] if source.model is None else [(f"{RESIDUAL}/data", theme.MODEL)]
-    plots = [slip]
-    plots += [[(line.path(axis, "/"), line.colour) for line in list_series(source)] for axis in "xyw"]
-    sizes = ";".join(["0.25"] * len(plots))
-    splitter = ET.SubElement(
-        container, "DockSplitter", {"orientation": "-", "count": str(len(plots)), "sizes": sizes}
+    start_ns = (
+        int(velocities["stamp"][0]) - round(float(velocities["t"][0]) * 1e9) if velocities.height else 0
     )
-    names = ("slip modulus [m/s]", "v_x [m/s]", "v_y [m/s]", "v_w [rad/s]")
-    for name, curves in zip(names, plots, strict=True):
-        area = ET.SubElement(splitter, "DockArea", {"name": name})
-        plot = ET.SubElement(area, "plot", {"style": "Lines", "mode": "TimeSeries"})
-        for curve, colour in curves:
-            ET.SubElement(plot, "curve", {"name": curve, "color": colour})
-    ET.SubElement(window, "currentTabIndex", {"index": "0"})
-    ET.SubElement(root, "use_relative_time_offset", {"enabled": "1"})
-    return root
+    stamps = start_ns + np.rint(rows["t_start"].fill_null(0.0).to_numpy() * 1e9).astype(np.int64)
+    levels = [_LEVELS.get(str(name), 20) for name in rows["severity"].cast(pl.String)]
+    fields: dict[str, Given] = {
+        "stamp.sec": stamps // 10**9,
+        "stamp.nanosec": stamps % 10**9,
+        "level": np.array(levels, dtype=np.uint8),
+        "name": rows["id"].to_list(),
+        "msg": rows["text"].to_list(),
+    }
+    writer.write_columns("/slip/findings", "rcl_interfaces/msg/Log", stamps + shift_ns, fields)
 
 
-def write_text(path: Path, text: str) -> Path:
-    """Write a text file atomically.
+def write_layout(name: str, path: Path) -> Path:
+    """Write a layout of `LAYOUTS`, of Foxglove and Lichtblick, or of PlotJuggler, that shows such a log.
 
     Raises:
         ReportError: ``export_not_written``.
     """
     with writing_export(where=path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, text.encode())
+        shipped = resources.files("pipeline.report").joinpath("layouts", LAYOUTS[name])
+        replace_file(path, shipped.read_bytes())
     return path
 
 
-def write_csv(source: ExportSource, folder: Path) -> list[Path]:
-    """Write every table of a run as `<table>.csv`.
+def write_tables(manifest: Manifest, to: Literal["csv", "parquet"], folder: Path) -> list[Path]:
+    """Write every table of a run as `<table>.csv` or `<table>.parquet`.
 
-    A column with a unit in its contract has it in its heading, for example `v_x [m/s]`. Rows are read and
-    written in batches: memory does not grow with the run.
+    In CSV, a column with a unit in its contract has it in its heading, for example `v_x [m/s]`, and a text
+    that a spreadsheet would take for a formula has a quote in front. Parquet has units and frames in its
+    metadata.
 
     Args:
-        source: the run.
+        manifest: the run.
+        to: the format.
         folder: output folder; created if missing, and filled when all tables are written.
 
     Returns:
@@ -408,13 +149,18 @@ def write_csv(source: ExportSource, folder: Path) -> list[Path]:
         ReportError: ``export_not_written``.
     """
     with writing_export(where=folder), _fill_folder(folder) as draft:
-        for table in sorted(source.manifest.tables):
-            heads = {name: _name_column(table, name) for name in source.columns(table)}
-            with (draft / f"{table}.csv").open("wb") as file:
-                file.write(format_csv(pl.DataFrame(schema=list(heads.values()))).encode())
-                for frame in source.batches(table):
-                    file.write(format_csv(frame, header=False).encode())
-    return [folder / f"{table}.csv" for table in sorted(source.manifest.tables)]
+        for table in sorted(manifest.tables):
+            path, target = manifest.path(table), draft / f"{table}.{to}"
+            check_size(path, manifest.count_rows(table))
+            with name_damage(path):
+                if to == "parquet":
+                    shutil.copyfile(path, target)
+                    continue
+                frame = pl.scan_parquet(path, glob=False)
+                texts = (cs.string() | cs.enum() | cs.categorical()).cast(pl.String)
+                heads = {name: _name_column(table, name) for name in frame.collect_schema().names()}
+                frame.with_columns(quote_formulas(texts)).rename(heads).sink_csv(target)
+    return [folder / f"{table}.{to}" for table in sorted(manifest.tables)]
 
 
 @contextmanager

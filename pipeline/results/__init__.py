@@ -48,8 +48,6 @@ if TYPE_CHECKING:
         Growth,
         Interval,
         Json,
-        Learned,
-        LearnedShare,
         Moments,
         Moves,
         Named,

@@ -320,14 +320,12 @@ class Unexplained(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     """Structure of the residual that no catalogued effect explains.
 
     Attributes:
-        kind: `formula`, `learned`, `lasting` or `region`: what describes it.
+        kind: `formula`, `lasting` or `region`: what describes it.
         share: of the held-out loss of the model that a function of the recorded signals removes; or of the
             residual's variance that is correlated for longer than noise and random motion.
         channel: x, y or w.
         channels: every channel with structure.
         path: path of the search that identified it.
-        quantity: `position` or `heading`, of which a learned term removes the share.
-        of, times: input that a learned term depends on most, and how many times as much as on any other.
         sizes: RMS of lasting motion by channel [m/s, rad/s].
         region: with nearly all of the error.
         formula: a formula effect as text of a model file, a suggestion that no model holds.
@@ -339,9 +337,6 @@ class Unexplained(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     channel: str = "x"
     channels: tuple[str, ...] = ()
     path: str = ""
-    quantity: str = ""
-    of: str = ""
-    times: float = 0.0
     sizes: dict[str, float] = {}
     region: Region | None = None
     formula: str | None = None
@@ -448,32 +443,6 @@ class SlipBudget(msgspec.Struct, frozen=True):
         return [("effect", one) for one in self.shares] + rest
 
 
-class LearnedShare(msgspec.Struct, frozen=True):
-    """Share of an error above the noise floor that the physics removes, and that with the learned term."""
-
-    physics: float = math.nan
-    with_learned: float = math.nan
-
-
-class Learned(msgspec.Struct, frozen=True, rename={"helps": "kept"}):
-    """Gain of a learned term beyond the effects.
-
-    Attributes:
-        helps: whether it does.
-        reason: why it does not; None where it does.
-        t_mrmse_m, r_mrmse_rad: errors over 2 s with it.
-        explained_share: by error.
-        term: the term, as a table of model files; None where it does not help.
-    """
-
-    helps: bool = False
-    reason: str | None = None
-    t_mrmse_m: float = math.nan
-    r_mrmse_rad: float = math.nan
-    explained_share: dict[str, LearnedShare | None] = {}
-    term: dict[str, object] | None = None
-
-
 class CommandedTurn(msgspec.Struct, frozen=True):
     """Share of the commanded yaw rate that a robot reaches, with its 95 % interval.
 
@@ -546,7 +515,6 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
         model: model file with the identified effects, fitted, as text; None where no model could be judged.
         budget: causes of the slip and of the 2 s errors of the ideal model, for each input.
         need: whether the log is long enough; None where no effect has a curve.
-        learned: gain of a learned term beyond the effects; None where nothing was judged.
         commanded_turn: share of the commanded yaw rate that the robot reaches; None without a body command.
     """
 
@@ -573,7 +541,6 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     model: str | None = None
     budget: tuple[SlipBudget, ...] = ()
     need: DataNeed | None = None
-    learned: Learned | None = None
     commanded_turn: CommandedTurn | None = None
 
     @property

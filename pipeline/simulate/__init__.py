@@ -34,9 +34,7 @@ from pipeline.simulate.facts import (
     unknown_name,
 )
 from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
-from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
-from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, list_topics, publish
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
     INCIDENTS,
@@ -56,6 +54,7 @@ from pipeline.simulate.scenario import (
     Scenario,
     State,
 )
+from pipeline.simulate.topics import list_topics, publish
 
 Stamps = Ints
 
@@ -105,96 +104,6 @@ def _bunch(time_s: Floats, longest_s: float) -> Floats:
     return ends[np.searchsorted(ends, time_s)]
 
 
-# Logs of platforms that speak protobuf: the same tables as messages of their types.
-#
-# Types as farm-ng/farm-ng-core and farm-ng/farm-ng-amiga declare them; enumerations stand as the numbers that
-# they are in a message.
-
-_CORE, _CANBUS, _FILTER = "farm_ng.core.proto", "farm_ng.canbus.proto", "farm_ng.filter.proto"
-TYPES: Final[dict[str, str]] = {
-    f"{_CORE}.Vec3F64": "double x = 1; double y = 2; double z = 3",
-    f"{_CORE}.QuaternionF64": f"{_CORE}.Vec3F64 imag = 1; double real = 2",
-    f"{_CORE}.Rotation3F64": f"{_CORE}.QuaternionF64 unit_quaternion = 1",
-    f"{_CORE}.Isometry3F64": f"{_CORE}.Rotation3F64 rotation = 1; {_CORE}.Vec3F64 translation = 2",
-    f"{_CORE}.Pose": f"{_CORE}.Isometry3F64 a_from_b = 1; string frame_a = 2; string frame_b = 3; "
-    f"{_CORE}.Vec3F64 linvel_of_a_in_b = 4; {_CORE}.Vec3F64 angvel_of_a_in_a = 5",
-    f"{_CANBUS}.Twist2d": "float linear_velocity_x = 1; float linear_velocity_y = 2; "
-    "float angular_velocity = 3",
-    f"{_CANBUS}.AmigaTpdo1": "uint32 node_id = 1; double stamp = 2; int32 control_state = 3; "
-    "double measured_speed = 4; double measured_angular_rate = 5; uint32 pto_bits = 6; "
-    "uint32 hbridge_bits = 7",
-    f"{_CANBUS}.AmigaV6CanbusState": f"{_CANBUS}.AmigaTpdo1 amiga_tpdo1 = 1; "
-    "double battery_charge_level = 3; bool last_send_error = 4",
-    f"{_FILTER}.FilterState": f"{_CORE}.Pose pose = 1; bool has_converged = 2; bool is_calibrated = 3; "
-    "double heading = 6",
-}
-_NUMBERS: Final = {"double": 1, "float": 2, "int32": 5, "bool": 8, "string": 9, "uint32": 13}
-_MESSAGE, _OPTIONAL = 11, 1
-
-
-def is_protobuf(type_name: str) -> bool:
-    """Whether a type is one of these."""
-    return type_name in TYPES
-
-
-def write_protobuf(tables: Sequence[Messages], clock: Clock, path: Path, *, marked: bool = True) -> None:
-    """Write tables as an MCAP log of protobuf messages, in time order."""
-    from mcap_protobuf.writer import Writer  # noqa: PLC0415 - heavy
-
-    messages: list[tuple[int, int, Any]] = []
-    for number, table in enumerate(tables):
-        columns = {
-            name: np.broadcast_to(np.asarray(value, dtype=object), table.log_s.shape).tolist()
-            for name, value in table.fields.items()
-        }
-        for row, time in enumerate(stamp_times(clock, table.log_s).tolist()):
-            message = _make_classes()[table.type_name]()
-            for name, column in columns.items():
-                _set(message, name, column[row])
-            messages.append((time, number, message))
-    with path.open("wb") as stream, Writer(stream) as writer:
-        for time, number, message in sorted(messages, key=lambda one: one[:2]):
-            writer.write_message(tables[number].topic, message, time, time)
-        if marked:
-            writer.add_metadata(*_MARK)
-
-
-def _set(message: Any, path: str, value: object) -> None:  # noqa: ANN401 - made at run time
-    *inner, name = path.split(".")
-    for part in inner:
-        message = getattr(message, part)
-    kind = message.DESCRIPTOR.fields_by_name[name].cpp_type
-    whole = isinstance(value, float) and kind not in {5, 6}
-    setattr(message, name, int(value) if whole else value)  # type: ignore[call-overload]
-
-
-@cache
-def _make_classes() -> dict[str, Any]:
-    """A class for every type."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]  # noqa: PLC0415 - heavy
-
-    pool = descriptor_pool.DescriptorPool()
-    for package in (_CORE, _CANBUS, _FILTER):
-        file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto3")
-        file.dependency.extend([] if package == _CORE else [f"{_CORE}.proto"])
-        for name, text in TYPES.items():
-            if name.rpartition(".")[0] != package:
-                continue
-            declared = file.message_type.add(name=name.rpartition(".")[2])
-            for line in text.split("; "):
-                kind, field, _, number = line.split(" ")
-                plain = kind in _NUMBERS
-                declared.field.add(
-                    name=field,
-                    number=int(number),
-                    label=_OPTIONAL,
-                    type=_NUMBERS.get(kind, _MESSAGE),
-                    type_name=None if plain else f".{kind}",
-                )
-        pool.Add(file)
-    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(name)) for name in TYPES}
-
-
 _BOOTED_NS = 100_000_000_000
 _MARK = ("simulation", {"by": "slip simulate"})
 """Metadata record of every simulated log: it is never pooled with recordings."""
@@ -219,9 +128,6 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
     tables = publish(run, layout.topics or list_topics(layout, scenario))
     if not layout.topics:
         tables += [*messages.state_tables(run), *messages.decoy_tables(run)]
-    if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
-        write_protobuf(messages.cut_gaps(run, tables), scenario.clock, path, marked=marked)
-        return
     with LogWriter(path) as writer:
         for table in messages.cut_gaps(run, tables):
             header = None if table.header_s is None else stamp_headers(scenario.clock, table.header_s)
@@ -258,12 +164,11 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Case:
-    """A named scenario and what it shows, in one line; a machine when it is built of rigid bodies."""
+    """A named scenario and what it shows, in one line."""
 
     name: str
     shows: str
     scenario: Scenario
-    machine: SkidSteer | None = None
 
 
 def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
@@ -300,11 +205,8 @@ for _name, _given in read_facts("bases.toml").items():
 
 
 def _make_case(name: str, given: dict[str, Any]) -> Case:
-    shows, base, machine = given.pop("shows"), _BASES[given.pop("base")], given.pop("machine", None)
-    if isinstance(machine, str):
-        machine = {"base": machine}
-    made = None if machine is None else _change(MACHINES[machine.pop("base")], machine)
-    return Case(name, shows, _change_scenario(base, given), made)
+    shows, base = given.pop("shows"), _BASES[given.pop("base")]
+    return Case(name, shows, _change_scenario(base, given))
 
 
 CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml").items())
@@ -321,19 +223,17 @@ class Changes(TypedDict, total=False):
     Attributes:
         seed: of all random numbers.
         duration_s: length of the run.
-        vehicle: a name of `VEHICLES`; brings its usual layout along.
-        layout: a name of `LAYOUTS`.
+        vehicle: one, or a name of `VEHICLES`; brings its usual layout along.
+        layout: one, or a name of `LAYOUTS`.
         program: what is driven.
-        platform: a name of `PLATFORMS`; brings its vehicle and topics along.
         written: see `Scenario`.
     """
 
     seed: int | None
     duration_s: float | None
-    vehicle: str | None
-    layout: str | None
+    vehicle: str | Vehicle | None
+    layout: str | Layout | None
     program: str | None
-    platform: str | None
     written: tuple[EffectSpec, ...]
 
 
@@ -385,13 +285,11 @@ def simulate_case(
     """
     scenario = make_scenario(name, effects, **changes)
     if play is not None:
-        scenario = _play(scenario, play, name)
+        scenario = _play(scenario, play)
     target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        machine = None if name is None else find_case(name).machine
-        run = simulate_run(scenario) if machine is None else simulate_skid_steer(scenario, machine)
-        write_log(run, target)
+        write_log(simulate_run(scenario), target)
     except OSError as problem:
         what = f"the log cannot be written ({problem.strerror})"
         raise SimulateError(
@@ -400,17 +298,10 @@ def simulate_case(
     return target
 
 
-def _play(scenario: Scenario, path: Path, name: str | None) -> Scenario:
+def _play(scenario: Scenario, path: Path) -> Scenario:
     """The scenario driven with the commands of a recording."""
-    _refuse_machine(name, "drives its own program", "Leave --play out")
     played = read_played(path, scenario.vehicle)
     return replace(scenario, played=played, duration_s=max(float(played.time_s[-1]) + 0.5, 1.0))
-
-
-def _refuse_machine(name: str | None, why: str, hint: str) -> None:
-    if name is not None and find_case(name).machine is not None:
-        what, hint = f"a case of rigid bodies {why}", f"{hint} or choose another case"
-        raise SimulateError("wrong_vehicle", what, where=name, hint=hint)
 
 
 def make_scenario(
@@ -419,25 +310,19 @@ def make_scenario(
     *,
     seed: int | None = None,
     duration_s: float | None = None,
-    vehicle: str | None = None,
-    layout: str | None = None,
+    vehicle: str | Vehicle | None = None,
+    layout: str | Layout | None = None,
     program: str | None = None,
-    platform: str | None = None,
     written: tuple[EffectSpec, ...] = (),
 ) -> Scenario:
     """The scenario of a named case with changes; see `Changes`."""
     scenario = Scenario() if name is None else find_case(name).scenario
-    if vehicle or platform:
-        _refuse_machine(name, "keeps its own vehicle", "Leave the vehicle out")
     if vehicle is not None:
         usual = replace(scenario.recording, layout="usual")
-        scenario = replace(scenario, vehicle=find_vehicle(vehicle), recording=usual)
+        made = find_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
+        scenario = replace(scenario, vehicle=made, recording=usual)
     if layout is not None:
         scenario = replace(scenario, recording=replace(scenario.recording, layout=layout))
-    if platform is not None:
-        made = find_platform(platform)
-        recording = replace(scenario.recording, layout=made.layout, deployment="absent")
-        scenario = replace(scenario, vehicle=made.vehicle, recording=recording)
     find_layout(scenario.recording.layout, scenario.vehicle)
     if program is not None:
         known = get_args(ProgramName)

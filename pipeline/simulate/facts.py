@@ -13,22 +13,6 @@ import numpy as np
 
 from pipeline.core import Floats, SlipError, guess_names
 
-Source = Literal[
-    "command",
-    "wish",
-    "wheels",
-    "odometry",
-    "filter",
-    "localization",
-    "tracking",
-    "relocalization",
-    "satellites",
-    "correction",
-    "imu",
-    "battery",
-    "once",
-]
-
 
 @dataclass(frozen=True)
 class Q:
@@ -56,12 +40,7 @@ class Published:
 
     Attributes:
         topic, type_name: where and what.
-        source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
-            ``filter`` the same with the gyro's heading; ``localization``; ``tracking``, the same in a frame
-            that never jumps, and ``relocalization``, where that frame is, dated ahead; ``satellites``, its
-            place on Earth and the velocity of its sensor over ground; ``correction``, the transform from the
-            localization's frame to the odometry's; ``imu``; ``battery``; ``once`` at the start; ``wish``, a
-            body command that the controller never gets.
+        source: whose times and quantities it has, an entry of `SOURCES`.
         fields: by field path a quantity, several for an array, a text of them, or a constant.
         every: one message in so many is published.
         stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
@@ -69,7 +48,7 @@ class Published:
 
     topic: str
     type_name: str
-    source: Source
+    source: str
     fields: Mapping[str, Value] = field(default_factory=dict)
     every: int = 1
     stamp: str = "header"
@@ -430,38 +409,3 @@ def _choose_usual(vehicle: Vehicle) -> str:
     if vehicle.kind != "differential":
         return vehicle.kind
     return {"husky_a200": "husky", "warthog": "warthog"}.get(vehicle.name, "tf")
-
-
-_WIDTH_M = 0.05
-
-
-def describe_robot(name: str, vehicle: Vehicle, joints: Mapping[str, str]) -> str:
-    """A description in which every wheel is a joint of base_link.
-
-    Args:
-        name: of the robot.
-        vehicle: its geometry.
-        joints: names of the wheel joints by their place, ``front_left`` and the like; ``left`` for the only
-            axle. Places that begin with ``steer`` steer.
-    """
-    parts = ['<link name="base_link"/>']
-    for corner, joint in joints.items():
-        y = 0.5 * vehicle.track_width_m * (1.0 if corner.endswith("left") else -1.0)
-        if vehicle.kind == "ackermann":
-            x = vehicle.wheelbase_m if "front" in corner or corner.startswith("steer") else 0.0
-        else:
-            x = vehicle.wheelbase_m * {"front": 0.5, "rear": -0.5}.get(corner.split("_")[0], 0.0)
-        parts.append(_write_joint(joint, (x, y), vehicle.wheel_radius_m, steers=corner.startswith("steer")))
-    return f'<?xml version="1.0"?><robot name="{name}">{"".join(parts)}</robot>'
-
-
-def _write_joint(joint: str, position: tuple[float, float], radius_m: float, *, steers: bool) -> str:
-    link = joint.removesuffix("_joint") + "_link"
-    shape = f'<cylinder radius="{radius_m}" length="{_WIDTH_M}"/>'
-    geometry = "" if steers else f"<collision><geometry>{shape}</geometry></collision>"
-    kind, axis = ("revolute", "0 0 1") if steers else ("continuous", "0 1 0")
-    return (
-        f'<link name="{link}">{geometry}</link><joint name="{joint}" type="{kind}">'
-        f'<parent link="base_link"/><child link="{link}"/>'
-        f'<origin xyz="{position[0]} {position[1]} 0" rpy="0 0 0"/><axis xyz="{axis}"/></joint>'
-    )

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         DriveSource,
         PoseContent,
         PoseSource,
-        PowerSource,
         Signal,
         Sources,
         is_localization,

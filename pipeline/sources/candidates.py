@@ -140,27 +140,6 @@ class TopicSource:
 
 
 @dataclass(frozen=True)
-class PowerSource:
-    """Currents and voltages of the drive.
-
-    Attributes:
-        currents: of single motors, drawn from the battery; summed.
-        voltages: of the battery; averaged. Empty if none is recorded.
-        reason: why they were chosen.
-        sign: -1 if drawn current is negative.
-    """
-
-    currents: tuple[Signal, ...]
-    voltages: tuple[Signal, ...]
-    reason: str
-    sign: int = 1
-
-    def __str__(self) -> str:
-        drawn = ", ".join(map(str, self.currents))
-        return f"{drawn}; voltage {', '.join(map(str, self.voltages)) or 'not recorded'}"
-
-
-@dataclass(frozen=True)
 class Sources:
     """The choice for one log; None if the log has nothing for a role.
 
@@ -168,7 +147,6 @@ class Sources:
         command, wheels, pose, imu, interval: source of each role.
         notes: remarks on the choice.
         others: by role, the alternatives, the best first.
-        power: source of the drive's electric power.
     """
 
     command: DriveSource | None
@@ -178,14 +156,12 @@ class Sources:
     interval: TopicSource | None
     notes: tuple[str, ...] = ()
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
-    power: PowerSource | None = None
 
     @property
     def topics(self) -> set[str]:
         """Names of the topics that are used."""
         drives = [self.command, self.wheels, None if self.pose is None else self.pose.wheels]
         signals = [signal for one in drives if one is not None for signal in one.signals]
-        signals += [] if self.power is None else [*self.power.currents, *self.power.voltages]
         named = [one.topic for one in (self.pose, self.imu, self.interval) if one is not None]
         velocity = (
             [] if self.pose is None else [self.pose.velocity, *(one.topic for one in self.pose.headings)]
@@ -459,30 +435,3 @@ def _rank_pairs(
             yield 2.5, pair, "a pair of topics whose names do not say that they are measured"
         elif not commanded and command_is_named:
             yield 2.5, pair, "a pair of topics beside one named as the command"
-
-
-def choose_power(types: Mapping[str, str]) -> PowerSource | None:
-    """Currents of motors by the types of their messages, else by names of numbers, else the battery's.
-
-    Args:
-        types: message type by topic, of one robot.
-    """
-    typed = {topic: power for topic, kind in types.items() if (power := find_type(kind).power) is not None}
-    motors = [topic for topic in sorted(typed) if not typed[topic].is_whole]
-    readings = {topic: find_type(kind).number for topic, kind in types.items()}
-    numbers = {topic: number.field for topic, number in readings.items() if number is not None}
-    drawn, volts = (
-        [Signal(topic, numbers[topic]) for topic in sorted(numbers) if end.search(topic.lower())]
-        for end in (ELECTRIC["current"], ELECTRIC["voltage"])
-    )
-    if not motors and drawn:
-        return PowerSource(tuple(drawn), tuple(volts), "numbers named as current and voltage")
-    for topic in [*motors, *(topic for topic in sorted(typed) if typed[topic].is_whole)]:
-        power = typed[topic]
-        voltages = [Signal(topic, field) for field in power.voltage] or volts
-        reason = (
-            "of the whole battery, other consumers included" if power.is_whole else "motors by their type"
-        )
-        currents = tuple(Signal(topic, field) for field in power.current)
-        return PowerSource(currents, tuple(voltages), reason, power.sign)
-    return None

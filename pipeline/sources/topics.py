@@ -20,7 +20,6 @@ from pipeline.sources.candidates import (
     Sources,
     Topics,
     TopicSource,
-    choose_power,
     is_localization,
 )
 from pipeline.sources.configuration import (
@@ -199,9 +198,6 @@ def choose_sources(
         interval=chooser.choose_interval(configuration),
         notes=tuple(chooser.notes),
         others=chooser.others,
-        power=choose_power(
-            {topic: chooser.types[topic] for topic in chooser.of_type(*chooser.types.values())}
-        ),
     )
     return sources.separated()
 

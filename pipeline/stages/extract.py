@@ -42,7 +42,6 @@ from pipeline.stages.drive import (
     read_signal,
     read_speed,
 )
-from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.findings import Finding, StageError, blame_damage
 from pipeline.stages.lost_messages import fill_gaps
 from pipeline.stages.pose_topics import Cut, read_bodies
@@ -104,7 +103,7 @@ class Extracted:
     """Result of the extract stage.
 
     Attributes:
-        tables: commands, wheels, poses, imu, empty without a source; and power, if recorded.
+        tables: commands, wheels, poses, imu, empty without a source.
         findings: findings of the stage.
         start_ns: stamp at which t is zero.
         paused_s: total of the silences that do not count, see `clocks.find_pauses`.
@@ -190,9 +189,7 @@ class Extraction:
     def run(self) -> Extracted:
         """All tables."""
         tables = {"poses": self.poses(), "commands": self._commands, "wheels": self._wheels}
-        power, findings = tabulate_power(self.sources.power, self._ordered, self._seconds, tables["poses"])
-        self.findings += findings
-        tables |= {"imu": self.imu()} | ({} if power.is_empty() else {"power": power})
+        tables["imu"] = self.imu()
         clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()

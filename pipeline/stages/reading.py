@@ -264,11 +264,6 @@ def list_wanted(
             if imu.orientation:
                 names += [*axis_fields(imu.orientation, "xyzw"), *filter(None, [imu.frame])]
             signals += [Signal(sources.imu.topic, name) for name in names]
-    if sources.power is not None:
-        signals += [
-            replace(signal, field=signal.fields()[0])
-            for signal in (*sources.power.currents, *sources.power.voltages)
-        ]
     if sources.interval is not None:
         signals.append(Signal(sources.interval.topic, "data"))
     used = [source for source in every if source in (sources.command, sources.wheels, sources.pose)]

@@ -32,8 +32,7 @@ from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.ladder import LadderStep, ModelAssessment, note_fit
-from pipeline.estimation.learned_step import fit_and_hold_out
+from pipeline.estimation.ladder import LadderStep, ModelAssessment, judge_whole, note_fit
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Effect, Model, ModelFile, Timing, find_effect, name_term
 from pipeline.report.motion_view import MotionStage, MotionView
@@ -130,8 +129,9 @@ class PreparedRun:
         """
 
         def fit() -> Judged:
-            fitted, held_out = fit_and_hold_out(self.data, model)
-            return Judged(fitted, held_out, estimate_intervals(fitted) if model.effects else NOTHING)
+            whole = judge_whole(self.data, model)
+            fitted = whole.fitted
+            return Judged(fitted, whole.held_out, estimate_intervals(fitted) if model.effects else NOTHING)
 
         with self.lock:
             return self._fits.recall(model.effects, fit)
@@ -165,7 +165,7 @@ class PreparedRun:
             known = self._fits.find(model.effects)
             if known is not None:
                 return known.errors
-            return self._errors.recall(model.effects, lambda: fit_and_hold_out(self.data, model)[1].pooled)
+            return self._errors.recall(model.effects, lambda: judge_whole(self.data, model).errors)
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model with its present values: held out where a fit gave these, else as they are."""

@@ -17,7 +17,6 @@ export const buildModel = (pane) => {
   const cards = session.effects.map((effect) => buildCard(pane, effect));
   model.replaceChildren(
     h("h2", {}, "Model"),
-    ...session.warnings.map((told) => h("p", { class: "doubts warning", role: "status" }, told)),
     cards.length ? h("ul", { class: "cards" }, cards) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
     h("h2", {}, "Add an effect"),
     buildNext(pane),

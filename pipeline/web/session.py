@@ -21,9 +21,9 @@ from pipeline.models import (
     Model,
     ModelFile,
     Parameter,
-    ResidualTerm,
     format_model,
     list_effects,
+    list_own_effects,
     make_parameter,
     name_effect,
     parse_model,
@@ -221,9 +221,7 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
         "errors": _errors(step.ladder[-1]),
         "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
         "floor": _errors(session.floor) if session.floor else None,
-        # Effects that the model loader excluded, with the reasons.
-        "warnings": list(file.warnings),
-        "effects": [show_effect(file, name, step) for name in step.order if name not in file.omitted],
+        "effects": [show_effect(file, name, step) for name in step.order],
         "undo": session.steps[session.at].said if session.at > 0 else None,
         "redo": session.steps[session.at + 1].said if session.at + 1 < len(session.steps) else None,
         "history": [each.said for each in session.steps[: session.at + 1]][-_LATEST:],
@@ -257,7 +255,6 @@ def list_formulas(effect: Effect) -> list[str]:
 
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
     """Every effect that exists on a vehicle, ordered from the command to the pose."""
-    every: tuple[type[Effect], ...] = (*list_effects(), ResidualTerm)
     return [
         {
             "id": effect.id,
@@ -265,7 +262,7 @@ def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
             "about": summarize_effect(effect),
             "acts_on": effect.place.name.lower(),
         }
-        for effect in every
+        for effect in (*list_effects(), *list_own_effects().values())
         if vehicle.kind in effect.kinds
     ]
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pipeline.words.diagnosis import (
         VERDICT,
         describe,
-        format_learned_share,
         format_lines,
         format_short,
         format_suggestion,

@@ -7,7 +7,6 @@ from itertools import pairwise
 
 from pipeline.core import (
     INPUT_WORDS,
-    enumerate_texts,
     format_angle,
     format_part,
     format_share,
@@ -269,11 +268,9 @@ def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
     effects += [text for item in felt for text in _format_ambiguous(item, falls)]
     others = [text for one in minor for text in _format_effect(one, run, falls)]
     others += [text for item in small for text in _format_ambiguous(item, falls)]
-    learned = run.learned
     return [
         *_label("effects", effects),
         *_label("remaining", _format_remaining(run)),
-        *_label("learned", [] if learned is None or learned.helps else [format_learned_share(run)]),
         *findings,
         *_label("smaller", others),
         *_label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)]),
@@ -382,8 +379,6 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         if last.r_mrmse_rad >= ABOVE_FLOOR * floor.r_mrmse_rad > 0.0:
             turn, least = format_angle(last.r_mrmse_rad), format_angle(floor.r_mrmse_rad)
             rows.append(f"{turn} in heading, noise floor {least}")
-    if run.learned is not None and run.learned.helps:
-        rows.append(format_learned_share(run))
     rest = run.unexplained
     if rest is None:
         return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]
@@ -431,34 +426,6 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
     how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"
     return [f"next steps: {'; '.join(steps)}, {how}"]
-
-
-def format_learned_share(run: RunDiagnosis) -> str:
-    """The share that a learned term explains beyond the physics, or why it does not help; else empty.
-
-    Where there are encoders, it is learned between wheels and body.
-    """
-    learned = run.learned
-    scope = "between wheels and body, " if run.by_path else ""
-    if learned is None or not learned.helps:
-        reason = None if learned is None else learned.reason
-        return f"{scope}a function learned from the data does not help: {reason}" if reason else ""
-    # Below the noise floor a share is of nothing.
-    known = {
-        ERRORS_OVER_2S[name][0]: one
-        for name, one in learned.explained_share.items()
-        if one is not None and one.physics < 1.0 and one.with_learned < 1.0
-    }
-    if not known:
-        return ""
-    learns = "a function learned from the data, which names no cause,"
-    if not run.effects:
-        shares = [f"{format_share(one.with_learned)} of the {words} error" for words, one in known.items()]
-        return f"{scope}{learns} would remove {enumerate_texts(shares)} above the noise floor"
-    removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
-    with_learned = enumerate_texts([format_share(one.with_learned) for one in known.values()])
-    effects = f"the effects remove {enumerate_texts(removed)} above the noise floor"
-    return f"{scope}{effects}; with {learns} {with_learned}"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:

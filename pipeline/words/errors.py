@@ -69,8 +69,6 @@ _WHOLE = 1.005
 _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Smallest unused share of a drive that is reported: in uniform driving it can be a fifth.
 _LEAST_SHOWN = 0.25
-_MATTERS = 2.0
-"""Least factor of an input over all others at which it is said."""
 _SPANS = 3
 """Number of spans in a sentence."""
 _UNITS = {"x": "m/s", "y": "m/s", "w": "rad/s"}
@@ -188,16 +186,6 @@ def describe_structure(rest: Unexplained) -> str:
         repeats = [words for name, words in _REPEATS.items() if name in names]
         text = f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
         return f"{text}: it repeats {enumerate_texts(repeats)}" if repeats else text
-    if rest.kind == "learned":
-        matters = (
-            f"; {rest.of} matters {rest.times:.0f} times as much as any other"
-            if rest.times >= _MATTERS
-            else ""
-        )
-        return (
-            f"a learned term removes {format_share(rest.share, 0)} of the {rest.quantity} error over 2 s: it "
-            f"depends most on {rest.of}{matters}"
-        )
     if rest.kind == "lasting":
         whose = "the wheels' " if rest.path == "wheels" else "the "
         sizes = {

@@ -38,7 +38,7 @@ def diagnosis_as_json(run: RunDiagnosis) -> dict[str, Any]:
         entry["text"] = describe_moments(moments)
         for span, part in zip(moments.spans, entry["spans"], strict=True):
             part["text"] = name_span(span)
-    for key in ("noise_floor", "learned", "disturbance"):
+    for key in ("noise_floor", "disturbance"):
         content[key] = content[key] or {}
     if run.disturbance is not None:
         content["disturbance"]["text"] = describe_rest(run)

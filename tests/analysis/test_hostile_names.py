@@ -10,10 +10,10 @@ from xml.sax.saxutils import quoteattr
 
 import pytest
 import yaml
+from simulated_platforms import PLATFORMS, simulate_platform
 from verbs import run_verb
 
 from pipeline.export import list_targets
-from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.simulate.facts import Published
 
 NAME = (
@@ -41,7 +41,7 @@ def write_log(path: Path, monkeypatch: pytest.MonkeyPatch, name: str = NAME, **r
         ]
     monkeypatch.setitem(PLATFORMS, "hostile", replace(kind, topics=tuple(topics)))
     effects = {"drive_lag": 0.3}
-    return simulate_case(None, effects, out=path, seed=5, duration_s=40.0, platform="hostile")
+    return simulate_platform("hostile", effects, out=path, seed=5, duration_s=40.0)
 
 
 def test_names_of_a_log_are_data_in_every_file_that_is_made_of_it(
@@ -62,7 +62,7 @@ def test_names_of_a_log_are_data_in_every_file_that_is_made_of_it(
             assert any(one in answer.stderr for one in refusals)
             continue
         text = answer.stdout
-        if target.name in {"python", "traction"}:
+        if target.name == "python":
             space: dict[str, object] = {}
             exec(compile(ast.parse(text), "exported", "exec"), space)  # noqa: S102 - that is what it is for
             assert space["VEHICLE"] == NAME

@@ -11,15 +11,15 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
+from simulated_platforms import PLATFORMS, Platform, fix, ground_velocity, simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.logs import definition_text, open_log
 from pipeline.recording.log_choice import Choice, choose
-from pipeline.simulate import PLATFORMS, Platform, simulate_case
 from pipeline.simulate.facts import Published, Q
-from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist
+from pipeline.simulate.topics import Fields, imu, joints, odometry, twist
 from pipeline.sources import load_configuration
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
@@ -36,7 +36,7 @@ def publish(
     platform = Platform(PLAIN, topics) if kind is None else replace(kind, topics=topics)
     monkeypatch.setitem(PLATFORMS, "made_up", platform)
     effects = {"drive_lag": 0.3}
-    return simulate_case(None, effects, out=folder / "run.mcap", seed=5, duration_s=30.0, platform="made_up")
+    return simulate_platform("made_up", effects, out=folder / "run.mcap", seed=5, duration_s=30.0)
 
 
 def rewrite(log: Path, change: Callable[[str, Any], Messages | None]) -> Path:
@@ -282,9 +282,7 @@ def test_hidden_effects_are_named_by_satellites(
     drive = (twist("/a200_0042/platform/cmd_vel"), *DRIVE[1:])
     monkeypatch.setitem(PLATFORMS, "made_up", Platform(HUSKY, (*drive, *topics)))
     effects = {"effective_track": 1.5, "drive_lag": 0.3, "lateral_skid": 0.08}
-    log = simulate_case(
-        None, effects, out=tmp_path / "run.mcap", seed=3, duration_s=180.0, platform="made_up"
-    )
+    log = simulate_platform("made_up", effects, out=tmp_path / "run.mcap", seed=3, duration_s=180.0)
     options = Options(out=tmp_path / "results", report=False, diagnosis=True)
     diagnosis = analyze_log(log, options).summary["diagnosis"]
     assert isinstance(diagnosis, dict)

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 from platforms import hidden_effects, try_platform
+from simulated_platforms import PLATFORMS, simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.recording.log_choice import Choice, choose
-from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.sources import load_configuration
 
 VESC = "/sensors/core.state.speed, /sensors/servo_position_command.data"
@@ -147,7 +147,7 @@ def record(name: str, folder: Path, duration_s: float = 20.0) -> Choice:
     """The choice that is made for a short log of a platform."""
     platform = PLATFORMS[name]
     effects = hidden_effects(platform)
-    log = simulate_case(None, effects, out=folder / "run.mcap", seed=5, duration_s=duration_s, platform=name)
+    log = simulate_platform(name, effects, out=folder / "run.mcap", seed=5, duration_s=duration_s)
     return choose(open_log(log), load_configuration(log), {})
 
 

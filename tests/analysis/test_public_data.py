@@ -1,6 +1,8 @@
 """Public data sets, a few made-up rows of each in its own format: recognized, and analyzed."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,35 +10,21 @@ from fomo_session import EFFECTIVE_TRACK, write_session
 from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from simulated_platforms import simulate_platform
 from verbs import run_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.simulate import simulate_case
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def test_fomo_is_recognized_and_what_it_lacks_is_said(tmp_path: Path) -> None:
-    session = write_session(tmp_path / "red_2025-10-14-11-41", duration_s=20.0, imu=False)
-    said = json.loads(run_verb("inspect", session, "--json").stdout)
-    assert said["vehicle"] == "warthog"
-    assert said["problem"] is None
-    roles = {role: found["topic"] if found else None for role, found in said["roles"].items()}
-    assert roles["pose"] == "/ppk_gnss/pose"
-    assert "/warthog/platform/motor/left/cmd_velocity" in roles["command"]
-    assert "/warthog/platform/motor/left/status/velocity" in roles["wheels"]
-    notes = " ".join(said["notes"])
-    assert "a recording of FoMo" in notes
-    assert "without a heading" in notes
-    assert "not in the folder: vectornav.csv, xsens.csv, metadata/cmd_velocity.csv" in notes
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("imu", [True, False])
-def test_a_session_of_fomo_is_analyzed(tmp_path: Path, *, imu: bool) -> None:
-    session = write_session(tmp_path / "red_2025-10-14-11-41", imu=imu)
-    outcome = analyze_log(session, Options(out=tmp_path / "results", report=False, diagnosis=True))
-    findings = {finding["id"] for finding in outcome.manifest.read("findings").to_dicts()}
-    assert ("heading_from_imu" if imu else "heading_from_course") in findings
+def test_a_folder_of_tables_becomes_a_log_by_the_script_of_the_examples(tmp_path: Path) -> None:
+    session, log = write_session(tmp_path / "red_2025-10-14-11-41"), tmp_path / "session.mcap"
+    subprocess.run([sys.executable, EXAMPLES / "tables_to_mcap.py", session, log], check=True)
+    outcome = analyze_log(log, Options(out=tmp_path / "results", report=False, diagnosis=True))
+    assert outcome.summary["vehicle"] == "warthog"
+    assert "heading_from_imu" in {finding["id"] for finding in outcome.manifest.read("findings").to_dicts()}
     (effect,) = outcome.summary["diagnosis"]["effects"]
     assert effect["id"] == "effective_track"
     assert effect["parameters"]["k"]["value"] == pytest.approx(EFFECTIVE_TRACK, rel=0.02)
@@ -81,7 +69,7 @@ def as_bag(log: Path) -> Path:
 def test_a_bag_of_ros_1_is_recognized_and_its_effect_is_named(
     tmp_path: Path, platform: str, effects: dict[str, float], lacks: str
 ) -> None:
-    log = simulate_case(None, effects, out=tmp_path / "run.mcap", seed=3, duration_s=90.0, platform=platform)
+    log = simulate_platform(platform, effects, out=tmp_path / "run.mcap", seed=3, duration_s=90.0)
     bag = as_bag(log)
     log.unlink()
     said = json.loads(run_verb("inspect", bag, "--json").stdout)
@@ -93,7 +81,7 @@ def test_a_bag_of_ros_1_is_recognized_and_its_effect_is_named(
 
 
 def test_a_topic_that_is_not_what_its_type_says_serves_where_it_is_named(tmp_path: Path) -> None:
-    log = simulate_case(None, {}, out=tmp_path / "run.mcap", seed=3, duration_s=20.0, platform="tartandrive")
+    log = simulate_platform("tartandrive", {}, out=tmp_path / "run.mcap", seed=3, duration_s=20.0)
     assert json.loads(run_verb("inspect", log, "--json").stdout)["roles"]["command"] is None
     (tmp_path / "run.toml").write_text('[command]\ntopic = "/cmd"\n', encoding="utf-8")
     named = json.loads(run_verb("inspect", log, "--json").stdout)["roles"]["command"]

@@ -5,12 +5,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from simulated_platforms import PLATFORMS, scene_of, simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.logs import open_log
 from pipeline.recording.log_choice import choose
-from pipeline.simulate import PLATFORMS, make_scenario, simulate_case, simulate_run, write_log
+from pipeline.simulate import make_scenario, simulate_case, simulate_run, write_log
 from pipeline.sources import load_configuration
 
 Hidden = dict[str, float]
@@ -79,7 +80,7 @@ def test_a_platform_with_two_sets_of_wheels_is_told_by_what_it_is_asked(
     plain = [one for one in platform.topics if "description" not in one.topic]
     topics = [replace(one, topic=f"/{name}/{one.topic.rsplit('/', 1)[-1]}") for one in plain]
     layout = replace(platform.layout, topics=tuple(topics))
-    scenario = make_scenario(None, {}, seed=3, duration_s=10.0, platform="rosbot_xl_mecanum")
+    scenario = scene_of("rosbot_xl_mecanum", {}, seed=3, duration_s=10.0)
     vehicle = replace(platform.vehicle, max_sideways_mps=fastest_mps)
     recording = replace(scenario.recording, layout=layout)
     log = tmp_path / "run.mcap"
@@ -109,8 +110,6 @@ def test_hidden_effects_of_mecanum_platforms_are_named_whatever_the_drive(
     platform: str, seed: int, tmp_path: Path
 ) -> None:
     hidden = {"lateral_scale": 0.85, "roller_slip": 0.2, "drive_lag": 0.25}
-    log = simulate_case(
-        None, hidden, out=tmp_path / "run.mcap", seed=seed, duration_s=180.0, platform=platform
-    )
+    log = simulate_platform(platform, hidden, out=tmp_path / "run.mcap", seed=seed, duration_s=180.0)
     found = list_found(diagnose(log))
     assert found == pytest.approx(hidden, rel=0.1)

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import threading
 import time
 from pathlib import Path
 
@@ -56,20 +55,6 @@ def test_everything_at_once_costs_itself_and_nothing_else(mess: Path, tmp_path: 
 @pytest.mark.long
 def test_each_alone_costs_itself_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
     assert damage_season.main() == 0, capsys.readouterr().out
-
-
-def test_looking_for_text_tables_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "dead").mkdir()
-    never = threading.Event()
-
-    def hang(folder: Path) -> None:
-        if folder.name == "dead":
-            never.wait(10.0)
-
-    monkeypatch.setattr("pipeline.batch.recordings.recognize_text_folder", hang)
-    (skipped,) = find_recordings([str(tmp_path)], settle_s=0.0, patience_s=0.2).skipped
-    never.set()
-    assert (skipped.path.name, "does not answer" in skipped.reason) == ("dead", True)
 
 
 @pytest.mark.parametrize("name", ["a pipe", "a link to a device", "a socket"])

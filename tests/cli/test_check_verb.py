@@ -23,7 +23,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, (name, effects) in enumerate(drives.items(), start=1):
         out = folder / f"{name}.mcap"
         simulate_case("ideal_husky", effects, out=out, duration_s=60.0, seed=number)
-    run("model", "new", "husky.toml", "--vehicle", "husky_a200", "--effects", "drive_lag", cwd=folder)
+    run("model", "new", "husky.toml", "drive_lag", "--vehicle", "husky_a200", cwd=folder)
     run("model", "fit", "husky.toml", "--on", "logs/a.mcap", cwd=folder)
     return folder
 

@@ -31,7 +31,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
     without = {words for words, names in options.items() if names and "--results" not in names}
     assert without == {
         "effects", "fleet map merge", "model new", "model new-effect",
-        "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
+        "model literature", "model show", "simulate",
     }  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest
     done = run_program("--install-completion", "--shell", "bash")
     assert done.returncode == 0, done.stderr
     (script,) = (path for path in tmp_path.rglob("slip") if path.is_file())
-    assert all(word in script.read_text() for word in ("doctor", "new-effect", "--trust-code"))
+    assert all(word in script.read_text() for word in ("doctor", "new-effect", "--effects"))
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("HOME", str(tmp_path / "file"))
     refused = run_verb("--install-completion", "--shell", "zsh")

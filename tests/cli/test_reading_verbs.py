@@ -43,22 +43,15 @@ def test_results_that_do_not_tell_a_vehicle_are_one_line(
     assert "do not say which vehicle" in line
 
 
-def test_a_damaged_diagnosis_is_not_exported(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = Store(place / "results").manifests()[0].path("diagnosis.json")
+@pytest.mark.parametrize("to", ["mcap", "csv", "parquet"])
+def test_a_damaged_table_is_not_exported(place: Path, capsys: pytest.CaptureFixture[str], to: str) -> None:
+    path = Store(place / "results").manifests()[0].path("slip")
     path.write_bytes(path.read_bytes()[:-40])
-    words = [
-        "export",
-        "field/wide",
-        "--to",
-        "mcap",
-        "--file",
-        place / "x.mcap",
-        "--results",
-        place / "results",
-    ]
+    words = ["export", "field/wide", "--to", to, "--file", place / "x", "--results", place / "results"]
     assert slip(*words) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert "has changed since it was written" in line
+    assert "slip.parquet" in line
+    assert not (place / "x").exists()
 
 
 def test_a_copied_log_is_the_stored_run(place: Path) -> None:

@@ -7,22 +7,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from simulated_platforms import ORIGIN_DEG, PLATFORMS
 from verbs import run_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.terrain_map import Beside, draw_up_terrain, locate_on_earth, read_beside
-from pipeline.simulate import (
-    PLATFORMS,
-    Ground,
-    Program,
-    Recording,
-    Scenario,
-    simulate_run,
-    write_log,
-)
+from pipeline.simulate import Ground, Program, Recording, Scenario, simulate_run, write_log
 from pipeline.simulate.path import CompactedGround
-from pipeline.simulate.sensors import ORIGIN_DEG
 from pipeline.stages.satellite import from_local_plane, to_local_plane
 from pipeline.store import Store
 
@@ -86,14 +78,6 @@ def test_cells_on_earth_are_polygons_of_their_size(earth: Path) -> None:
     east, north, _ = to_local_plane(corners[:, 1], corners[:, 0], np.zeros(len(corners))).T
     assert np.hypot(np.diff(east[:5]), np.diff(north[:5])) == pytest.approx(4.0, abs=0.01)
     assert "What to expect by place" in written["terrain.html"].read_text(encoding="utf-8")
-
-
-def test_power_comes_from_the_battery(earth: Path) -> None:
-    cells = draw_up_terrain(Store(earth / "results")).cell_table
-    power = cells["power"].drop_nulls()
-    # The simulated robot idles at 40 W and rolls against 120 N at up to 2 m/s.
-    assert power.len() > 0.9 * cells.height
-    assert 40.0 < float(np.median(power.to_numpy())) < 280.0
 
 
 def test_a_run_whose_log_has_gone_or_changed_is_not_placed_by_it(earth: Path, tmp_path: Path) -> None:

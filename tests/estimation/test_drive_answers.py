@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from simulated_platforms import simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -20,7 +21,6 @@ from pipeline.simulate import (
     PoseSensor,
     Program,
     Scenario,
-    simulate_case,
     simulate_run,
     write_log,
 )
@@ -102,7 +102,7 @@ def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp
     """4 m/s^2 are 78 rad/s^2 of a wheel of 5 cm: it was named a brake lag and a pause of reversals."""
     hidden = {"acceleration_limit": 78.0, "steering_lag": 0.1, "steering_gain": 0.88}
     out = tmp_path / "run.mcap"
-    log = simulate_case(None, hidden, out=out, seed=3, duration_s=120.0, platform="f1tenth")
+    log = simulate_platform("f1tenth", hidden, out=out, seed=3, duration_s=120.0)
     told = _diagnose(log)
     found = {effect.id: next(iter(effect.parameters.values())).value for effect in told.effects}
     assert found == pytest.approx(hidden, rel=0.05)

@@ -60,7 +60,7 @@ def test_driving_backward_is_no_turn_and_less_than_an_update_is_nothing() -> Non
 def test_the_verb_measures_them_on_a_log(tmp_path: Path) -> None:
     log = simulate_case("husky_tile", out=tmp_path / "run.mcap", duration_s=60.0)
     model = tmp_path / "husky.toml"
-    print_verb("model", "new", model, "--vehicle", "husky_a200", "--effects", "effective_track")
+    print_verb("model", "new", model, "effective_track", "--vehicle", "husky_a200")
     refused = run_verb("model", "export", model, "--to", "nav2_amcl")
     assert refused.returncode == 1
     assert "--on LOG" in refused.stderr

@@ -37,7 +37,6 @@ HANG_S = 10
 PARSERS = {
     "json": json.loads,
     "python": ast.parse,
-    "traction": ast.parse,
     "gazebo": ET.fromstring,
     "px4": find_target("px4").read_current,
 }
@@ -156,7 +155,7 @@ def write_models() -> list[str]:
     fit = (
         '[fit]\ninput = "command"\nblocks = 3\n[[fit.runs]]\nrun = "a/b"\nsha256 = "ab"\npose_delay_s = 0.1\n'
     )
-    texts.append(f'effects = ["own.py"]\n{head}[[effect]]\nid = "tilt"\nk = 0.5\n{fit}')
+    texts.append(f'{head}[[effect]]\nid = "tilt"\nk = 0.5\n{fit}')
     return texts
 
 

@@ -47,7 +47,7 @@ READING = {
         ("model", "fit", "husky.toml", *ON, "--input", "measured"),
         ("model", "show", "husky.toml"),
         ("model", "drop", "husky.toml", "drive_lag", *ON),
-        ("model", "new", "plain.toml", "--vehicle", "husky_a200", "--effects", "drive_lag"),
+        ("model", "new", "plain.toml", "drive_lag", "--vehicle", "husky_a200"),
         ("model", "compare", "husky.toml", "plain.toml", *ON),
         ("model", "new", "jackal.toml", "--vehicle", "jackal"),
         ("model", "fit", "jackal.toml", *ON),

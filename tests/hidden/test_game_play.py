@@ -359,7 +359,6 @@ def test_poor_driving_gives_no_confident_wrong_name() -> None:
 
 @pytest.mark.long
 def test_rigid_bodies_show_what_was_built_into_them() -> None:
-    pytest.importorskip("mujoco", reason="needs the extra `sim`")
     records = score_many(list_jobs(["rigid"], range(20, 23), "each"))
     assert sum(map(is_found, records)) >= 0.8 * len(records), "\n".join(describe("rigid", records))
 

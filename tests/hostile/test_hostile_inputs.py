@@ -20,7 +20,7 @@ from pipeline.logs.writer import LogWriter
 
 START = 1_700_000_000_000_000_000
 LONGEST_LINE, LONGEST_S = 1000, 5.0
-NEVER_REFUSES = {"doctor", "model trusted", "model untrust"}
+NEVER_REFUSES = {"doctor"}
 
 LOGS = {
     "missing.mcap": r"there is no such file\. Check the path",
@@ -69,7 +69,8 @@ WORDS: list[tuple[str, str]] = [
     ("model new-effect wind.toml", r"side_wind\.py"),
     ("model new-effect drive_lag.py", "an effect is called so already"),
     ("model add missing.toml drive_lag --on field/wide", "missing.toml"),
-    ("model add husky.toml mine.py --on field/wide", r"Name its file above \[vehicle\] of the model file"),
+    ("model add husky.toml mine --on field/wide --effects gone.py", "gone.py: cannot be read"),
+    ("model show husky.toml --effects text.mcap", "text.mcap: the effects cannot be loaded"),
     ("model add husky.toml nothing --on field/wide", "no effect is called 'nothing'"),
     ("model add husky.toml effective_track --on text.mcap", "text.mcap"),
     ("model add husky.toml drive_lag --on", "--on names no run"),
@@ -86,7 +87,6 @@ WORDS: list[tuple[str, str]] = [
     ("model compare --on field/wide", "two model files are compared"),
     ("model literature nobody", "nobody"),
     ("model speed no.toml --on nowhere --within 10cm", "no.toml"),
-    ("model trust missing.toml", "missing.toml"),
     ("model export husky.toml --to ros_control", "Did you mean ros2_control"),
     ("model export husky.toml --to autoware", "husky_a200 is differential"),
     # Plans and simulations
@@ -195,7 +195,6 @@ MODELS = [
     (HEAD + FORMULA.replace("k *", "self *") + "self = 0.5\n", "5: "),
     (HEAD + '[[effect]]\nid = "drive_lag"\nv_x = "k * v0"\nk = 0.1\n', "4: .*of the catalogue is called"),
     (HEAD + "wheel_radius_m = inf\n", "3: .*wheel_radius_m"),
-    (HEAD + 'effects = ["mine.py"]\n', "3: .*inside a table.*first line"),
     (HEAD + "colour = 1\n", r"3: .*unknown key 'colour' in \[vehicle\]"),
     (HEAD + "[effect]\n", r"3: .*\[\[effect\]\]"),
     (HEAD + "[[effect]\n", "3: .*not a valid TOML"),
@@ -204,7 +203,8 @@ MODELS = [
     ('[vehicle]\npreset = "nope"\n', "2: .*no vehicle preset is called 'nope'. Write one of: "),
     ("[vehicle]\nwheel_radius_m = -1\n", "2: .*not valid"),
     ("format = 1\n", "1: .*no vehicle"),
-    ('effects = ["nowhere.py"]\n' + HEAD, "1: .*no such file of effects"),
+    ('effects = ["mine.py"]\n' + HEAD, "1: .*unknown key 'effects'"),
+    (HEAD + '[[effect]]\nid = "mine"\n', "4: no effect is called 'mine'.*--effects FILE.py"),
     ("note = " + "[" * 100_000, "deep"),
     ("a." * 200_000 + "b = 1\n", "parts"),
     *(

@@ -94,31 +94,6 @@ def test_a_type_with_its_own_definition(tmp_path: Path) -> None:
     assert read_topics(path, [Wanted("/x")]).of("/x")[0].fields["b"].tolist() == [2.5]
 
 
-def test_what_is_settled_is_written_and_forgotten(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    times = START + np.random.default_rng(5).permutation(4000)
-    with LogWriter(path, chunk_size=1000) as writer:
-        writer.metadata("early", {})
-        for low in range(0, 4000, 500):
-            part = times[(times >= START + low) & (times < START + low + 500)]
-            writer.write_columns("/x", FLOAT, part, {"data": (part - START).astype(float)})
-            writer.write_before(START + low + 500)
-            # What stays is a chunk in the making, of a thousand bytes.
-            assert not writer._waiting
-            assert path.parent.joinpath(writer._draft.name).stat().st_size > 20 * (low - 500)
-        writer.metadata("late", {"k": "v"})
-        # Earlier than what is written: it is not lost.
-        writer.write_columns("/x", FLOAT, np.array([START - 1]), {"data": [-1.0]})
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        logged = [m.log_time for _, _, m in reader.iter_messages(log_time_order=False)]
-        assert {record.name for record in reader.iter_metadata()} == {"early", "late"}
-    assert logged[:3500] == sorted(times.tolist())[:3500]
-    assert sorted(logged) == [START - 1, *sorted(times.tolist())]
-    found = read_topics(path, [Wanted("/x")]).of("/x")[0].fields["data"].tolist()
-    assert found == list(range(-1, 4000))
-
-
 def test_what_was_read_crosses_a_process_boundary(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_small(path)

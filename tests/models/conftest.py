@@ -1,11 +1,9 @@
-from pathlib import Path
-
 import pytest
+
+from pipeline.models import catalogue
 
 
 @pytest.fixture(autouse=True)
-def own_configuration(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A configuration folder of each test's own: what one trusts, another does not."""
-    folder = tmp_path_factory.mktemp("configuration")
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))
-    return folder
+def own_effects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What one test loads, another does not know."""
+    monkeypatch.setattr(catalogue, "_own", {})

@@ -56,7 +56,6 @@ def make_named(kind: str, name: str) -> ModelFile:
     known = {"wheel_radius.k": (0.96, 0.98), "a---é.k": (0.0, 0.2), "body_speed_limit.limit": (0.8, 1.0)}
     return make(
         *effects, wind, vehicle=rename(VEHICLES[kind], name), fit=fit, intervals=known, note=name,
-        warnings=(name,),
     )  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def test_the_times_with_half_of_the_error_are_found_where_it_is_above_the_noise(
     size = np.select(
         [(middle > 20.0) & (middle < 24.0), (middle > 40.0) & (middle < 42.0)], [30.0, 20.0], 1.0
     )
-    worse = replace(judged, physics=replace(judged.physics, held_out=replace(held, yaw=(floor * size,))))
+    worse = replace(judged, whole=replace(judged.whole, held_out=replace(held, yaw=(floor * size,))))
     (heading,) = find_moments(worse)
     start, end, share = msgspec.structs.astuple(heading.spans[0])
     assert (heading.run, heading.quantity, start, end) == (0, "heading", 20.0, 24.0)

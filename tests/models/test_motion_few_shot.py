@@ -9,7 +9,6 @@ from motion_runs import simulate, vehicle_of
 from verbs import run_slip, run_verb
 
 from pipeline.estimation import EstimationData, Fitted, Input, estimate_intervals, fit_model, score
-from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.models import Model, find_effect, read_model
 from pipeline.run import MotionError, MotionRun
 from pipeline.run.windows import cut_run, find_driven
@@ -32,7 +31,7 @@ def problem_of(run: MotionRun) -> EstimationData:
 
 
 def fit_with_prior(data: EstimationData, model: Model, numbers: dict[str, tuple[float, float]]) -> Fitted:
-    return fit_model(tie_to_prior(data, numbers), model, exact=True)
+    return fit_model(data.with_prior(numbers), model, exact=True)
 
 
 def test_a_run_is_cut_by_how_long_it_was_driven(run: MotionRun) -> None:
@@ -72,7 +71,7 @@ def test_a_sure_prior_holds_and_a_vague_one_changes_nothing(run: MotionRun) -> N
 
 
 def test_the_posterior_is_narrower_than_the_prior_and_holds_the_truth(run: MotionRun) -> None:
-    data = tie_to_prior(problem_of(cut_run(run, end_s=find_driven(run, 8.0))), KNOWN)
+    data = problem_of(cut_run(run, end_s=find_driven(run, 8.0))).with_prior(KNOWN)
     fitted = fit_model(data, MODEL, exact=True)
     estimates = estimate_intervals(fitted)
     for label, truth in (("effective_track.k", 1.8), ("lateral_skid.c", 0.08)):

@@ -11,7 +11,7 @@ from verbs import run_verb
 from pipeline.core.arrays import Floats
 from pipeline.estimation import EstimationData, Input, fit_model
 from pipeline.models import Model, Timing, read_model
-from pipeline.models.literature import MODELS, find_model
+from pipeline.models.literature import find_model, list_literature
 from pipeline.simulate import VEHICLES, Program
 from pipeline.simulate import State as SimulatedState
 
@@ -44,7 +44,7 @@ def change(model: Model, **values: float) -> Model:
     return model
 
 
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+@pytest.mark.parametrize("model", list_literature(), ids=lambda model: model.name)
 def test_every_model_has_formula_source_and_numbers(model: object) -> None:
     found = find_model(model.name)  # type: ignore[attr-defined]
     assert found.formula
@@ -53,7 +53,7 @@ def test_every_model_has_formula_source_and_numbers(model: object) -> None:
     assert bool(found.effects or found.terms) == (found.count_numbers() > 0)
 
 
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+@pytest.mark.parametrize("model", list_literature(), ids=lambda model: model.name)
 def test_a_model_file_of_each_is_written_and_read_back(model: object, tmp_path: Path) -> None:
     found = find_model(model.name)  # type: ignore[attr-defined]
     vehicle = "husky_a200" if "differential" in found.kinds else "f1tenth"

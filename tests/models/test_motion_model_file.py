@@ -3,9 +3,16 @@ from pathlib import Path
 import pytest
 from motion_runs import vehicle_of
 
-from pipeline.models import Model, ModelFile, format_model, list_effects, read_model, write_model
-from pipeline.models.catalogue import trust
-from pipeline.models.model_file import list_code, parse_model
+from pipeline.models import (
+    Model,
+    ModelFile,
+    format_model,
+    list_effects,
+    load_effects,
+    parse_model,
+    read_model,
+    write_model,
+)
 from pipeline.run import MotionError
 from pipeline.sources import list_configuration_files, load_configuration
 
@@ -91,26 +98,28 @@ def test_formulas_are_read_and_written() -> None:
     assert parse_model(format_model(file), HERE).model.effect("wind") == wind
 
 
-def test_effects_of_one_s_own_come_from_a_file_beside_the_model(tmp_path: Path) -> None:
+def test_effects_of_one_s_own_are_known_once_their_file_was_loaded(tmp_path: Path) -> None:
     (tmp_path / "my_effects.py").write_text(OWN_EFFECT, encoding="utf-8")
-    path = tmp_path / "m.toml"
-    path.write_text(
-        'effects = ["my_effects.py"]\n' + HEAD + '[[effect]]\nid = "tilt"\nk = 0.2\n', encoding="utf-8"
-    )
-    trust(list_code(path))
-    file = read_model(path)
+    text = HEAD + '[[effect]]\nid = "tilt"\nk = 0.2\n'
+    with pytest.raises(MotionError, match=r"model.toml:5: no effect is called 'tilt'.*--effects FILE.py"):
+        parse_model(text, HERE)
+    load_effects([tmp_path / "my_effects.py"])
+    file = parse_model(text, HERE)
     assert file.model.effect("tilt").values == {"k": 0.2}
-    assert file.warnings == ()
-    write_model(file, path)
-    assert read_model(path).model.ids == ("tilt",)
+    assert parse_model(format_model(file), HERE).model.ids == ("tilt",)
 
 
-@pytest.mark.parametrize(("text", "says"), [("1 / 0", "ZeroDivisionError"), ("x = 1", "no effect")])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1 / 0", "ZeroDivisionError"),
+        ("x = 1", "it defines no effect"),
+        (OWN_EFFECT.replace('"tilt"', '"drive_lag"'), "of the catalogue is called 'drive_lag'"),
+    ],
+)
 def test_a_file_of_effects_that_does_not_work_is_named(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "own.py").write_text(text, encoding="utf-8")
-    path = tmp_path / "m.toml"
-    path.write_text('effects = ["own.py"]\n' + HEAD, encoding="utf-8")
-    trust(list_code(path))
+    path = tmp_path / "own.py"
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(MotionError, match=says) as caught:
-        read_model(path)
-    assert caught.value.where == f"{path}:1"
+        load_effects([path])
+    assert caught.value.where == str(path)

@@ -13,7 +13,8 @@ from target_schemas import SCHEMAS
 from verbs import run_verb
 
 from pipeline import export
-from pipeline.export import export_model, list_targets
+from pipeline.export import Facts, export_model, list_targets
+from pipeline.export.spread import Response
 from pipeline.models import find_effect
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
@@ -31,7 +32,7 @@ CASES = [
 def test_targets_are_found_by_being_there() -> None:
     texts = [path.read_text("utf-8") for path in Path(export.__path__[0]).glob("[!_]*.py")]
     names = {target.name for target in list_targets()}
-    assert names == {*SCHEMAS, "json", "python", "traction"}
+    assert names == {*SCHEMAS, "json", "python"}
     assert sum(text.count(" = Target(") for text in texts) == len(names)
     assert all(target.about and target.source for target in list_targets())
 
@@ -82,8 +83,7 @@ def test_every_effect_stands_at_a_line_or_among_those_without_one(name: str, veh
         stands = any(f"{effect.id}.{p.name} = " in below for p in effect.parameters)
         assert stands or effect.id in unmapped, (effect.id, head)
     known = {e.id for e in file.model if any(p.quantities for p in e.parameters)}
-    # A steady motion depends on effects that no parameter of a controller stands for.
-    assert unmapped >= {e.id for e in file.model} - known or name == "simulator"
+    assert unmapped >= {e.id for e in file.model} - known
     assert unmapped != {e.id for e in file.model} or name in {"robot_localization", "nav2_amcl"}
 
 
@@ -95,9 +95,6 @@ def test_no_export_states_a_dimension_that_is_a_stand_in(target: export.Target, 
     if known is HUSKY and target.name in {"autoware", "vesc"}:
         return
     text = export_model(make_full(guess), target.name)
-    if target.name == "traction":
-        assert "0.123" not in text
-        return
     assert "Not known: " + " and ".join(names) in text
     # XML takes no two dashes: what to do is told without options, which it would have torn apart.
     assert "- -" not in text
@@ -171,46 +168,28 @@ SLIPPING = (
 )
 
 
-def test_the_factors_of_a_simulator_are_what_the_exported_function_does() -> None:
-    p = take("simulator", make(*SLIPPING))
-    speeds, turn = p["speeds_mps"], 0.25
-    for n, speed in enumerate(speeds):  # type: ignore[arg-type, var-annotated]
+def test_the_steady_motion_at_each_speed_is_that_of_the_exported_function() -> None:
+    response, turn = Response(Facts(make(*SLIPPING))), 0.25
+    for n, speed in enumerate(response.speeds.tolist()):
         half = turn * HUSKY.track_width_m / 2.0
         left, right = (speed - half) / HUSKY.wheel_radius_m, (speed + half) / HUSKY.wheel_radius_m
         rim = speed / HUSKY.wheel_radius_m
         straight = predict(make(*SLIPPING), [(-9.0, rim, rim)], 5.0)[-1]
         curved = predict(make(*SLIPPING), [(-9.0, left, right)], 5.0)[-1]
-        assert p["linear_factor"][n] == pytest.approx(straight[4] / speed, rel=1e-3)  # type: ignore[index]
-        assert p["angular_factor"][n] == pytest.approx(curved[6] / turn, rel=1e-3)  # type: ignore[index]
-    assert p["linear_lag_s"] == p["angular_lag_s"] == 0.3
+        assert response.linear[n] == pytest.approx(straight[4] / speed, rel=1e-3)
+        assert response.angular[n] == pytest.approx(curved[6] / turn, rel=1e-3)
 
 
 def test_a_multiplier_is_told_by_speed_where_one_does_not_fit() -> None:
     one = export_model(make(find_effect("effective_track")(k=1.8)), "ros2_control")
     assert "does not fit" not in one
     several = export_model(make(*SLIPPING), "ros2_control")
-    table = take("simulator", make(*SLIPPING))
+    response = Response(Facts(make(*SLIPPING)))
     line = next(line for line in several.splitlines() if "wheel_separation_multiplier does not fit" in line)
     pairs = re.findall(r"([\d.]+) at ([\d.]+) m/s", line)
     told = [float(value) for value, _ in pairs]
-    assert told == pytest.approx(table["wheel_separation_multiplier"], abs=1e-3)
-    assert [float(speed) for _, speed in pairs] == table["speeds_mps"]
-    # The controller turns as it is asked with the multiplier of the speed, on radii of that speed.
-    gain = table["linear_factor"][1] / table["wheel_separation_multiplier"][1]  # type: ignore[index]
-    assert gain == pytest.approx(table["angular_factor"][1], rel=1e-3)  # type: ignore[index]
-
-
-def test_a_simulator_that_skids_by_itself_needs_the_rest_of_the_factor(tmp_path: Path) -> None:
-    own = tmp_path / "sim.yaml"
-    own.write_text(export_model(make(find_effect("effective_track")(k=1.2)), "simulator"), "utf-8")
-    robot = make(find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3))
-    text = export_model(robot, "simulator", export.read_current(own, "simulator"))
-    found = read("simulator", text)
-    assert found["simulated_base.ros__parameters.angular_factor"] == pytest.approx([1.2 / 1.8] * 4, rel=1e-3)
-    assert found["simulated_base.ros__parameters.linear_factor"] == pytest.approx([1.0] * 4)
-    own.write_text("simulated_base: {ros__parameters: {speeds_mps: [1, 2]}}", "utf-8")
-    with pytest.raises(MotionError, match="not an export of a simulator"):
-        export.read_current(own, "simulator")
+    assert told == pytest.approx(response.separation.tolist(), abs=1e-3)
+    assert [float(speed) for _, speed in pairs] == response.speeds.tolist()
 
 
 @pytest.mark.parametrize(

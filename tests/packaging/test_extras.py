@@ -16,7 +16,7 @@ from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
 ROOT = Path(__file__).parents[2]
-EXTRAS = ("distributed", "llvmlite", "mujoco", "numba", "pandas", "s3fs", "sklearn", "starlette", "uvicorn",
+EXTRAS = ("distributed", "llvmlite", "numba", "pandas", "s3fs", "starlette", "uvicorn",
           "vl_convert")  # fmt: skip
 LEAN = f"""
 import sys

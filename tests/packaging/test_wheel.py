@@ -30,10 +30,11 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
 
     for folder, pattern in (
         ("pipeline/sources/presets", "*.toml"),
-        ("pipeline/logs/text_folders", "*.toml"),
+        ("pipeline/models/literature", "*.toml"),
         ("schemas", "*.py"),
         ("slip", "*.*"),
         ("pipeline/report", "page.*"),
+        ("pipeline/report/layouts", "*"),
         ("pipeline/report", "*.js"),
         ("pipeline/report/templates", "**/*.html"),
         ("pipeline/report", "catalogue.*"),

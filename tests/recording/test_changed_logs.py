@@ -11,10 +11,10 @@ from types import ModuleType
 import pytest
 from front import Answer, ask, find_roles, judge
 from rewritten_logs import Change, Log, list_changes, read, write
+from simulated_platforms import simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.recording.log_setup import set_up_log
-from pipeline.simulate import simulate_case
 
 ROOT = Path(__file__).parents[2]
 CASES = ROOT / ".." / "shared" / "cases"
@@ -45,7 +45,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Log,
         path = ROOT / "data_samples" / f"{name}.mcap"
         if not path.exists():
             path = tmp_path_factory.mktemp("drawn") / f"{name}.mcap"
-            simulate_case(None, {}, out=path, seed=5, duration_s=100.0, platform=name)
+            simulate_platform(name, {}, out=path, seed=5, duration_s=100.0)
         made[name] = (path, read(path), ask(path))
     return made
 

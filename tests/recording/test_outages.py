@@ -10,6 +10,7 @@ import pytest
 from drawn_motion import Drive, command, draw, measured, sides, tabulate
 from front import SAMPLES, find_roles
 from rewritten_logs import list_changes, read, write
+from simulated_platforms import simulate_platform
 from written_logs import write_log
 
 from pipeline.analysis import Options
@@ -17,7 +18,6 @@ from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
-from pipeline.simulate import simulate_case
 
 DIES, LIVES = 40.0, 70.0
 
@@ -132,7 +132,7 @@ def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["left encoder dies", "right encoder holds"])
 def test_an_encoder_of_mecanum_wheels_dies_beside_a_body_that_is_commanded(name: str, tmp_path: Path) -> None:
-    log = simulate_case(None, {}, out=tmp_path / "log.mcap", seed=5, duration_s=100.0, platform="dingo_o")
+    log = simulate_platform("dingo_o", {}, out=tmp_path / "log.mcap", seed=5, duration_s=100.0)
     roles = find_roles(log)
     (change,) = [one for one in list_changes() if one.name == name]
     made = change.make(read(log), roles)

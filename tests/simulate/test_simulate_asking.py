@@ -111,8 +111,6 @@ def test_every_case_can_be_made() -> None:
     assert {"husky_tile", "warthog_ice", "ackermann_gravel"} <= set(names)
     assert len(set(names)) == len(names)
     for case in list_cases():
-        if case.machine is not None:
-            continue
         run = simulate_run(replace(case.scenario, duration_s=12.0))
         assert run.poses.stamp_s.size > 50
 

@@ -9,7 +9,7 @@ from pipeline.logs.schema import bundled_structure, leaf_paths
 from pipeline.sources import ConfigurationError, Signal, convert_unit, find_preset
 from pipeline.sources.message_types import MessageType, find_type, list_types
 
-PARTS = ("drive", "number", "numbers", "joints", "pose", "fix", "ground_velocity", "imu", "power")
+PARTS = ("drive", "number", "numbers", "joints", "pose", "fix", "ground_velocity", "imu")
 KNOWN = sorted({kind for part in PARTS for kind in list_types(part)})
 BUNDLED = {name.replace("/msg/", "/") for name in bundled_types()}
 
@@ -30,7 +30,6 @@ def list_paths(kind: MessageType) -> list[str]:
         paths += [kind.joints.names, *(inner if kind.joints.interfaces else plain)]
     if kind.fix is not None:
         paths += [kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status]
-    paths += [*kind.power.current, *kind.power.voltage] if kind.power else []
     if kind.ground_velocity is not None:
         paths += [kind.ground_velocity.east, kind.ground_velocity.north]
     if kind.pose is not None:

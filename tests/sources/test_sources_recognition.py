@@ -1,9 +1,9 @@
 """The vehicle that a log tells: robot descriptions, words of names, message types."""
 
 import pytest
+from simulated_platforms import PLATFORMS
 
 from pipeline.logs import ChannelInfo
-from pipeline.simulate import PLATFORMS
 from pipeline.sources import (
     Recognized,
     find_alike,

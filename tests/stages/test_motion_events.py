@@ -8,8 +8,6 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.export import export_model
-from pipeline.models import Model, ModelFile
 from pipeline.run.signals import Limits, trace_traction
 from pipeline.simulate import (
     TRACTION,
@@ -151,18 +149,3 @@ def test_an_event_of_a_log_stands_in_its_table_its_findings_and_its_report(
     report = outcome.manifest.path("report.html").read_text(encoding="utf-8")
     assert finding["text"][1:] in report
     assert kind.replace("_", " ") in report
-
-
-def test_the_exported_function_needs_nothing_and_says_the_same() -> None:
-    vehicle = find_preset("husky_a200")
-    assert vehicle is not None
-    source = export_model(ModelFile(Model(vehicle, ())), "traction")
-    assert "import" not in source
-    space: dict[str, object] = {}
-    exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
-    judge = space["judge_traction"]
-    wheels, body = [0.8] * 240, [0.8] * 120 + [0.0] * 120
-    assert judge(wheels[:110], [0.0] * 110, body[:110], STEP_S) == "drive"  # type: ignore[operator]
-    assert judge(wheels[:160], [0.0] * 160, body[:160], STEP_S) == "spinning"  # type: ignore[operator]
-    codes = space["trace_traction"](wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[operator]
-    assert codes == trace_traction(wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[arg-type]

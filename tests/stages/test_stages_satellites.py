@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from simulated_platforms import fix, ground_velocity, to_earth
 from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
 from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
 from pipeline.simulate.facts import Published
-from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
-from pipeline.simulate.sensors import to_earth
+from pipeline.simulate.topics import imu, joints, twist
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver
 from pipeline.stages.satellite import (

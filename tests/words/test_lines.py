@@ -9,16 +9,13 @@ from pipeline.models import name_term
 from pipeline.results import (
     DataNeed,
     Finding,
-    Learned,
-    LearnedShare,
     Named,
-    PathLadder,
     Region,
     RunDiagnosis,
     Unexplained,
     Value,
 )
-from pipeline.words.diagnosis import describe, format_learned_share, format_short, list_findings, list_lines
+from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
 MANY = (
@@ -139,25 +136,6 @@ def test_motion_that_lasts_is_one_short_sentence() -> None:
     lasting = Unexplained("lasting", 0.98, "w", ("w",), "command", sizes={"w": 0.19})
     assert describe_unexplained(lasting) == (
         "the yaw error wanders for seconds at a time (0.19 rad/s); nothing that was tried explains it"
-    )
-
-
-def test_without_effects_a_learned_term_stands_beside_none() -> None:
-    share = {"t_mrmse_m": LearnedShare(0.0, 0.66), "r_mrmse_rad": LearnedShare(0.0, 0.02)}
-    text = format_learned_share(RunDiagnosis(learned=Learned(helps=True, explained_share=share)))
-    assert text.endswith(
-        "would remove 66 % of the position error and 2 % of the heading error above the noise floor"
-    )
-    assert "the effects" not in text
-
-
-def test_a_learned_term_is_said_of_the_path_that_it_was_learned_on() -> None:
-    learned = Learned(reason="the remaining error is at the noise floor")
-    run = RunDiagnosis(learned=learned)
-    assert format_learned_share(run) == f"a function learned from the data does not help: {learned.reason}"
-    both = replace(run, by_path={"wheels": PathLadder()})
-    assert format_learned_share(both).startswith(
-        "between wheels and body, a function learned from the data does"
     )
 
 

@@ -1,4 +1,4 @@
-"""Figures of slip: over the path, the commands and time, its distributions; power, steps of commands."""
+"""Figures of slip: over the path, the commands and time, its distributions; steps of commands."""
 
 import numpy as np
 import polars as pl
@@ -6,7 +6,7 @@ import polars as pl
 from pipeline.core import INPUT_WORDS, Floats, format_length, format_share
 from pipeline.report import figures, format_number, theme
 from pipeline.report.figures import Figure, Section, draw_shares, format_events, list_events
-from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series, thin_to_peaks
+from pipeline.report.scene import Scene, break_lines, thin_to_peaks
 from pipeline.report.theme import (
     MAP_HIGHEST,
     MAP_LOWEST,
@@ -22,7 +22,6 @@ from pipeline.report.theme import (
     make_axis,
     round_up,
     stack,
-    usual_ends,
 )
 
 
@@ -344,49 +343,6 @@ def _list_norms(scene: Scene) -> dict[str, pl.Series]:
 WINDOW_NORMS = Figure(
     "Distribution over 2 s windows", Section.HOW_BAD, draw_window_norms, order=30, id="window_norms"
 )
-
-_PANELS = {"current": ("current of the drive", "A"), "energy_per_m": ("energy per distance", "J/m")}
-
-
-def draw_power(scene: Scene) -> Drawing | None:
-    """Draw the current of the drive, and below it energy per metre if a voltage was recorded."""
-    table = scene.report.table("power")
-    if table is None or table.is_empty():
-        return None
-    lines = {name: _thin(table, name) for name in _PANELS if not table[name].drop_nulls().is_empty()}
-    if not lines:
-        return None
-    last = list(lines)[-1]
-    chart = stack(
-        *(_draw_power_panel(scene, name, frame, last=name == last) for name, frame in lines.items())
-    )
-    words = [f"{_PANELS[name][0]}: {_format_median(table[name])} {_PANELS[name][1]}" for name in lines]
-    rows = {f"power_{name}": frame for name, frame in lines.items()} | figures.span_rows(scene)
-    note = "Energy per distance is shown above 0.1 m/s; below zero the motors feed the battery."
-    return Drawing(
-        chart.properties(usermeta=figures.brush_over_time()), rows, note, f"Over time: {'; '.join(words)}."
-    )
-
-
-def _format_median(column: pl.Series) -> str:
-    return f"median {format_number(float(np.median(column.drop_nulls().to_numpy())))}"
-
-
-def _thin(table: pl.DataFrame, name: str) -> pl.DataFrame:
-    line = table.select("t", pl.lit(0).alias("piece"), value=pl.col(name)).drop_nulls()
-    return thin_series(line, "value", bins=LINE_BINS).select("t", "piece", "value", series=pl.lit("velocity"))
-
-
-def _draw_power_panel(scene: Scene, name: str, frame: pl.DataFrame, *, last: bool) -> Chart:
-    low, high = usual_ends(frame["value"], exact=True)
-    shown = find_range(frame, (low, high))
-    colour = figures.series_colour(["velocity"], {"velocity": "measured"})
-    x = figures.time_axis(scene) if last else figures.time_axis(scene, title=None)
-    chart = figures.draw_lines(scene, [f"power_{name}"], shown, colour, x)
-    return chart.properties(height=100, title=figures.title_panel(*_PANELS[name], shown))
-
-
-POWER = Figure("Power of the drive", Section.WHERE, draw_power, order=60, width="full", id="power")
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0

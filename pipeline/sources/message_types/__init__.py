@@ -9,7 +9,6 @@ of
 - ``numbers``: a sequence of numbers whose meaning only the user knows;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a position on Earth, a velocity east and north;
-- ``power``: fields of currents and voltages;
 - ``text``: a field with a JSON object, whose numbers are called ``field.key``;
 - ``stamp``: time of the measurement, for types without a header.
 
@@ -136,22 +135,6 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     convention: Convention = "flu"
 
 
-class PowerFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Currents [A] and voltages [V].
-
-    Attributes:
-        current: of single motors, drawn from the battery; summed.
-        voltage: of the battery; averaged.
-        sign: -1 if drawn current is negative.
-        is_whole: whether it is that of the whole battery, including other consumers.
-    """
-
-    current: list[str]
-    voltage: list[str] = []
-    sign: Literal[1, -1] = 1
-    is_whole: bool = False
-
-
 class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field with a JSON object that has some `keys`.
 
@@ -182,7 +165,6 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fix: FixFields | None = None
     ground_velocity: GroundVelocityFields | None = None
     imu: ImuFields | None = None
-    power: PowerFields | None = None
     text: TextFields | None = None
     stamp: StampField | None = None
 

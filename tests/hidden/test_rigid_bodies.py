@@ -5,14 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from game.rigid_bodies import MACHINES, SkidSteer, simulate_skid_steer
 from numpy.typing import NDArray
 
 from pipeline.simulate.facts import VEHICLES, SimulateError
 from pipeline.simulate.messages import SimulatedRun
-from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.scenario import Ground, Program, Scenario
-
-pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 Floats = NDArray[np.float64]
 SPIN = Scenario(program=Program("circle", speed_scale=0.0), duration_s=15.0)

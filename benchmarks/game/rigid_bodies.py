@@ -1,15 +1,15 @@
 """A four-wheel skid-steer of rigid bodies and friction: slip comes out of contact, not of a formula.
 
-Needs the ``sim`` extra. No effect of the catalogue is switched on here; the physical causes are: a wide
+No effect of the catalogue is switched on here; the physical causes are: a wide
 effective track from scrubbing wheels, late motion from little grip, drift from a slope or a payload.
 Wheels are heavy to turn (armature) and stiffly driven, contacts are explicit pairs with an elliptic friction
 cone and a soft tangential constraint: without these a simulated skid-steer scrubs far too much.
 """
 
-import importlib
 import math
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from pipeline.core import (
@@ -92,7 +92,7 @@ def simulate_skid_steer(scenario: Scenario, machine: SkidSteer) -> SimulatedRun:
         machine: masses, grip and motors.
 
     Raises:
-        SimulateError: ``mujoco_needed`` without the ``sim`` extra, ``wrong_vehicle`` for a car,
+        SimulateError: ``wrong_vehicle`` for a car,
             ``not_physical`` for a ground effect, hills or odd physics.
     """
     vehicle = scenario.vehicle
@@ -132,11 +132,6 @@ def _refuse_formulas(scenario: Scenario, effects: Effects) -> None:
 
 def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[Floats, Floats, Floats]:
     """Positions (n + 1, 3) and quaternions (n + 1, 4) in the plane's frame, wheel speeds (n, 2)."""
-    try:
-        mujoco = importlib.import_module("mujoco")
-    except ImportError as problem:
-        hint = "Install the extra: pip install 'slip-pipeline[sim]'"
-        raise SimulateError("mujoco_needed", "mujoco is not installed", hint=hint) from problem
     model = mujoco.MjModel.from_xml_string(_write_world(scenario, machine))
     data = mujoco.MjData(model)
     x, y, yaw = scenario.start_pose
