@@ -490,30 +490,3 @@ class Deployments(dy.Schema):
         names = ("slope_score", "roughness_score", "sinkage_score", "friction_score")
         known = sum((pl.col(name).is_not_null().cast(pl.Int64) for name in names), pl.lit(0))
         return known.is_in([0, 4])
-
-
-class Cells(Table):
-    """One row a frame, vehicle and cell of the map of what to expect; ``run`` is `*`.
-
-    ``dataset`` and ``terrain`` are `*` where several were driven in a cell.
-    """
-
-    VERSION: ClassVar[int] = 1
-
-    frame = name("in which x and y are: a place on Earth, a map that runs share, or one run's own")
-    input = source()
-    cell = bounded("m", "side of the cell", 0.0)
-    x = number("m", "middle of the cell, east on Earth", frame="map")
-    y = number("m", "middle of the cell, north on Earth", frame="map")
-    latitude = optional("deg", "of the middle; null in a frame that is not on Earth")
-    longitude = optional("deg", "of the middle; null in a frame that is not on Earth")
-    passes = count("crossings of the cell by all runs", 1)
-    runs = count("runs that crossed it", 1)
-    slip = bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
-    slip_low = optional("1", "lower quartile of it over crossings; null of a single one")
-    slip_high = optional("1", "upper quartile")
-    modulus = bounded("m/s", "slip modulus, median over crossings", 0.0)
-    energy = optional("J", "kinetic energy of the slip velocity, median; null without a mass")
-    lean = optional("rad", "inclination of the vehicle, median; null where it was not measured")
-    power = optional("W", "drawn from the battery, median; null where the log does not say")
-    keys = text("run/generation of every run counted, separated by spaces")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
-from cyclopts.types import PositiveFloat
 
 from pipeline import datasets, words
 from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
@@ -15,7 +14,6 @@ from pipeline.core import (
     INPUT_WORDS,
     PACKAGE,
     FigureFormat,
-    SlipError,
     align_rows,
     format_count,
     format_share,
@@ -262,20 +260,13 @@ def draw(  # noqa: D417 - arguments document themselves
     shared: Annotated[
         Path | None, Parameter(help="features of others, as slip fleet share writes them, to draw as well")
     ] = None,
-    terrain: bool = False,
-    cell: Annotated[
-        PositiveFloat | None, Parameter(help="side of a cell of --terrain [m] (default: 2)")
-    ] = None,
     figures: FigureFormat | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Write map.html: the literature, with the datasets of the results coloured by their slip.
 
-    With --terrain write terrain.html, cells.parquet and terrain.geojson: what to expect by place.
-
     Args:
-        terrain: map slip, energy, power and inclination by place, and slip by number of passes.
         figures: also write the figure in this format, for papers.
         json: print one JSON object.
         quiet: print nothing.
@@ -283,20 +274,6 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    if terrain:
-        others = {
-            "--deployments": deployments is not None,
-            "--show": show != "slip",
-            "--shared": shared is not None,
-            "--figures": figures is not None,
-        }
-        for option, is_given in others.items():
-            if is_given:
-                what = f"{option} is of the map of deployments"
-                raise SlipError("wrong_options", what, hint="Leave out --terrain, or that option.")
-        return _draw_terrain(results, cell, fed, json=json, quiet=quiet)
-    if cell is not None:
-        raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
     store = Store(results) if results == Path("results") else open_results(results).open_store()
     features = None if shared is None else datasets.read_features(shared)
@@ -324,20 +301,6 @@ def draw(  # noqa: D417 - arguments document themselves
     lines += [f"! {note}" for note in drawn.notes]
     lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")
     return print_result(content, lambda: lines, json=json, quiet=quiet)
-
-
-def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
-    """Write the terrain map of slip by position."""
-    from pipeline.report.fleet_pages import write_terrain  # noqa: PLC0415 - heavy
-
-    store = open_results(results).open_store()
-    drawn = datasets.draw_up_terrain(store, cell_m=datasets.CELL_M if cell is None else cell, fed=fed)
-    written = write_terrain(store, drawn)
-    content = {
-        **datasets.describe_terrain(drawn),
-        "written": {name: str(path) for name, path in written.items()},
-    }
-    return print_result(content, lambda: datasets.list_lines(drawn, written), json=json, quiet=quiet)
 
 
 def _format_value(value: float | None, unit: str) -> str:

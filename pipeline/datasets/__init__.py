@@ -1,4 +1,4 @@
-"""Runs together: datasets and their differences, levels of parameters, forecasts, trends, maps, checks.
+"""Runs together: datasets and their differences, levels of parameters, forecasts, trends, a map, checks.
 
 Input and output are tables. `rank_tests` holds the significance tests; pages are drawn by `pipeline.report`.
 """
@@ -88,15 +88,6 @@ if TYPE_CHECKING:
     )
     from pipeline.datasets.rank_tests import kendall_tau, list_swaps
     from pipeline.datasets.stored_fits import Against, ModelFit, contest_models, fit_to_runs, read_runs
-    from pipeline.datasets.terrain import CELL_M, SHARE_DIGITS, PassEffect, TerrainMap
-    from pipeline.datasets.terrain_map import (
-        GEOJSON,
-        PAGE,
-        describe_terrain,
-        draw_up_terrain,
-        list_features,
-        list_lines,
-    )
     from pipeline.datasets.trend import (
         TREND,
         ParameterTrend,

@@ -1,4 +1,4 @@
-"""Pages over runs: `slip fleet fit`, `slip fleet map --terrain`, and `slip compare --causes`."""
+"""Pages over runs: `slip fleet fit` and `slip compare --causes`."""
 
 import contextlib
 import json
@@ -14,7 +14,6 @@ from pipeline.core import (
     INPUT_WORDS,
     FigureFormat,
     format_count,
-    format_share,
     group_by,
     mapping_in,
     number_in,
@@ -24,18 +23,12 @@ from pipeline.core import (
 )
 from pipeline.datasets import (
     FLEET,
-    GEOJSON,
-    PAGE,
-    SHARE_DIGITS,
     Budget,
     Causes,
     Difference,
     FleetModel,
-    PassEffect,
-    TerrainMap,
     fit_results,
     list_differences,
-    list_features,
     name_causes,
     summarize_fleet,
     tabulate_budgets,
@@ -59,15 +52,10 @@ from pipeline.report import (
 )
 from pipeline.report.comparison_page import write_tables
 from pipeline.report.page import add_figures, render_figures
-from pipeline.report.scene import CAP_QUANTILE
 from pipeline.report.theme import (
     Chart,
     Drawing,
     encode_column,
-    find_extent,
-    fit_equal_aspect,
-    layer,
-    make_axis,
 )
 from pipeline.store import NoRunsError, Store
 
@@ -175,231 +163,6 @@ def _format_value(of: Mapping[str, object], row: Mapping[str, object]) -> tuple[
         return Cell(format_number(value), small=unit), ""
     texts = [text.replace("-", "\u2212") for text in split_interval(value, low, high)]
     return Cell(texts[0], small=unit), f"{texts[1]}\u00a0to\u00a0{texts[2]}"
-
-
-MOST_MAPS = 12
-"""Largest number of maps on a page: those with most runs and cells; the table of cells has all."""
-_SIDE = 420
-_DEGREES = 180.0 / math.pi
-_SHOWN = (
-    ("slip", "Slip", "share of the motion lost", "%"),
-    ("passes", "Passes", "crossings of the cell", ""),
-    ("spread", "Spread of slip", "between quartiles of crossings", "%"),
-    ("energy", "Energy of slip", "kinetic energy of the slip velocity", "J"),
-    ("power", "Power", "drawn from the battery", "W"),
-    ("lean", "Inclination", "of the vehicle", "deg"),
-)
-"""Column, title, description, and its unit for people."""
-
-
-def render_terrain(drawn: TerrainMap) -> str:
-    """Render the complete page as HTML."""
-    groups = _group_maps(drawn)
-    repeated = draw_passes(drawn.passes, drawn.effects)
-    notes = list(drawn.notes)
-    omitted = drawn.cell_table.select("frame", "vehicle").n_unique() - len(groups)
-    if omitted > 0:
-        notes.append(f"{omitted} more maps of fewer cells are in cells.parquet alone")
-    count = len(drawn.keys)
-    return render_figures(
-        "report/templates/terrain.html",
-        [picture for _, _, pictures in groups for picture in pictures] + repeated,
-        title="What to expect by place",
-        facts=[
-            format_count(count, "run"),
-            f"{drawn.cell_table.height} cells of {drawn.cell_m:g} m",
-            f"{drawn.crossings} crossings",
-            f"slip {INPUT_WORDS[drawn.input]}",
-        ],
-        groups=groups,
-        sentences_of_effects=[effect.describe() for effect in drawn.effects],
-        repeated=repeated,
-        effects=_tabulate_effects(drawn.effects),
-        notes=notes,
-        runs=list(drawn.keys),
-    )
-
-
-def _group_maps(drawn: TerrainMap) -> list[tuple[str, str, list[Picture]]]:
-    """Chapters of the page: number, name, maps."""
-    cell_table = drawn.cell_table.with_columns((pl.col("slip_high") - pl.col("slip_low")).alias("spread"))
-    sizes = cell_table.group_by("frame", "vehicle").agg(pl.col("runs").max(), pl.len().alias("count"))
-    order = sizes.sort("runs", "count", "frame", "vehicle", descending=[True, True, False, False])
-    groups = []
-    for number, row in enumerate(order.head(MOST_MAPS).iter_rows(named=True)):
-        mine = cell_table.filter(pl.col("frame") == row["frame"], pl.col("vehicle") == row["vehicle"])
-        members = len(drawn.frames[row["frame"]])
-        # A run without a shared frame has one of its own, called after it.
-        is_own = row["frame"] == f"run {next(iter(drawn.frames[row['frame']]))}"
-        name = f"{row['vehicle']}, {row['frame']}"
-        name += "" if is_own else f", {format_count(members, 'run')}"
-        pictures = [
-            Picture(f"map-{number}-{column}", title, _draw_cells(mine, drawn.cell_m, number, shown), "half")
-            for shown in _SHOWN
-            for column, title in [shown[:2]]
-            if _varies(mine, column)
-        ]
-        groups.append((f"frame-{number}", name, pictures))
-    return groups
-
-
-def _varies(cell_table: pl.DataFrame, column: str) -> bool:
-    known = cell_table[column].drop_nulls()
-    return not known.is_empty() and (column in {"slip", "passes"} or known.n_unique() > 1)
-
-
-def _draw_cells(
-    cell_table: pl.DataFrame, cell_m: float, number: int, shown: tuple[str, str, str, str]
-) -> Drawing:
-    """Draw a map of one quantity: one square per cell, equal scales in x and y."""
-    column, title, about, unit = shown
-    rows = cell_table.select(
-        low_x=pl.col("x") - 0.5 * cell_m,
-        high_x=pl.col("x") + 0.5 * cell_m,
-        low_y=pl.col("y") - 0.5 * cell_m,
-        high_y=pl.col("y") + 0.5 * cell_m,
-        slip=100.0 * pl.col("slip"),
-        spread=100.0 * pl.col("spread"),
-        energy=pl.col("energy"),
-        power=pl.col("power"),
-        lean=_DEGREES * pl.col("lean"),
-        passes=pl.col("passes").cast(pl.Float64),
-        runs=pl.col("runs").cast(pl.Float64),
-        terrain=pl.col("terrain"),
-    )
-    extent = [find_extent(pl.concat([rows[f"low_{axis}"], rows[f"high_{axis}"]])) for axis in "xy"]
-    height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1], width=_SIDE)
-    known = rows[column].drop_nulls()
-    top = float(known.quantile(CAP_QUANTILE, "linear") or 0.0) or 1.0
-    top = math.ceil(top) if column in {"passes", "runs"} else float(f"{top:.3g}")
-    in_unit = f" [{unit}]" if unit else ""
-    name = f"cells_{number}"
-    drawn = rows.with_columns(pl.col(column).clip(upper_bound=top).alias(f"{column}_shown"))
-    words = [("slip", "slip [%]", ".0f"), ("passes", "passes", ".0f"), ("runs", "runs", ".0f")]
-    words += [
-        ("energy", "energy [J]", ".2f"),
-        ("power", "power [W]", ".0f"),
-        ("lean", "inclination [deg]", ".1f"),
-    ]
-    chart = (
-        Chart.of_rows(f"{name}_{column}")
-        .mark("rect", stroke=theme.PAPER, strokeWidth=0.3)
-        .encode(
-            x=make_axis(
-                "low_x", "x [m]", scale={"domain": x_domain, "nice": False, "zero": False}, tickCount=5
-            ),
-            x2="high_x:Q",
-            y=make_axis(
-                "low_y", "y [m]", scale={"domain": y_domain, "nice": False, "zero": False}, tickCount=5
-            ),
-            y2="high_y:Q",
-            color=encode_column(
-                f"{column}_shown:Q",
-                scale={"range": list(theme.SLIP_RAMP), "interpolate": "rgb", "domainMin": 0.0},
-                legend={"title": f"{title.lower()}{in_unit}", "gradientLength": 120, "gradientThickness": 8},
-            ),
-            tooltip=[
-                "terrain:N",
-                *(
-                    encode_column(f"{one}:Q", title=said, format=form)
-                    for one, said, form in words
-                    if not rows[one].drop_nulls().is_empty()
-                ),
-            ],
-        )
-        .filter(f"datum.{column} !== null")
-        .properties(width=_SIDE, height=height)
-    )
-    middle = float(known.median() or 0.0)  # type: ignore[arg-type]
-    note = f"{about[:1].upper()}{about[1:]}; colours end at {top:,g}{f' {unit}' if unit else ''}."
-    summary = f"{title} in {known.len()} cells: median {middle:.3g}{f' {unit}' if unit else ''}."
-    return Drawing(chart, {f"{name}_{column}": drawn}, note, summary)
-
-
-def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[Picture]:
-    """Draw the slip of further passes relative to the first one, one figure per dataset with an estimate."""
-    pictures = []
-    for number, effect in enumerate(effects):
-        mine = passes.filter(pl.col("dataset") == effect.dataset)
-        if effect.reason or mine.is_empty():
-            continue
-        rows = mine.select(
-            passes=(pl.col("passes") + 1).cast(pl.Float64),
-            ratio="ratio",
-            low="low",
-            high="high",
-            line=(pl.col("passes").cast(pl.Float64) * math.log1p(effect.change)).exp(),
-            crossings=pl.col("crossings").cast(pl.Float64),
-        )
-        name = f"passes_{number}"
-        base = Chart.of_rows(name)
-        scale = {"domainMin": 1, "nice": False, "zero": False}
-        across = make_axis("passes", "number of the pass over a place", scale=scale, tickMinStep=1)
-        bars = (
-            base.mark("rule", color=theme.QUIET, strokeWidth=2)
-            .encode(x=across, y="low:Q", y2="high:Q")
-            .filter("datum.low !== null")
-        )
-        dots = base.mark("point", size=60, filled=True, color=theme.SLIP, opacity=1).encode(
-            x=across,
-            y=make_axis("ratio", "slip over that of the first pass", scale={"type": "log"}, tickCount=5),
-            tooltip=[
-                encode_column("ratio:Q", title="slip over the first pass", format=".2f"),
-                encode_column("crossings:Q", title="crossings", format=".0f"),
-            ],
-        )
-        line = base.mark("line", color=theme.MODEL, strokeWidth=1.6).encode(x=across, y="line:Q")
-        chart = layer(bars, line, dots).properties(width=_SIDE, height=240)
-        note = "Bars: 95 % intervals by stretches of 10 s. Line: the change per pass of the table."
-        pictures.append(
-            Picture(
-                f"passes-{number}",
-                effect.dataset,
-                Drawing(chart, {name: rows}, note, effect.describe()),
-                "half",
-            )
-        )
-    return pictures
-
-
-_UNDETERMINED = 10.0
-"""Change per pass above which the end of an interval says nothing: slip grows elevenfold."""
-
-
-def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
-    head = (
-        Column("dataset"),
-        Column("change of slip per pass", number=True),
-        Column("interval"),
-        Column("beside a drift with time"),
-        Column("places", number=True),
-        Column("repeated crossings", number=True),
-    )
-    rows = [
-        [
-            effect.dataset,
-            MISSING if effect.reason else _format_change(effect.change),
-            MISSING if effect.reason else _format_ends(effect.low, effect.high),
-            MISSING if math.isnan(effect.beside_time[0]) else _format_ends(*effect.beside_time),
-            str(effect.places),
-            str(effect.repeated),
-        ]
-        for effect in effects
-    ]
-    return Table(
-        "Slip by number of passes within a run, beside place, direction, speed and turning", head, rows
-    )
-
-
-def _format_ends(low: float, high: float) -> str:
-    if high > _UNDETERMINED:
-        return "undetermined"
-    return f"{_format_change(low)} to {_format_change(high)}"
-
-
-def _format_change(share: float) -> str:
-    """Format a change per pass as a percentage."""
-    return format_share(share, SHARE_DIGITS).replace("-", "\u2212").replace(" ", "\u202f")
 
 
 # Datasets side by side as budgets by cause, and what they differ by.
@@ -576,17 +339,3 @@ def update_fleet(store: Store) -> None:
     if (store.root / FLEET).is_file():
         with contextlib.suppress(NoRunsError):
             write_fleet(store, *fit_results(store))
-
-
-def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
-    """Write `cells.parquet`, `terrain.html` and, if georeferenced, `terrain.geojson`; the files by name."""
-    keys = " ".join(drawn.keys)
-    names = drawn.cell_table.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))
-    store.write_results_table("cells", names.drop("i", "j"))
-    written = {"cells.parquet": store.root / "cells.parquet"}
-    features = list_features(drawn)
-    if features:
-        text = json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
-        written[GEOJSON] = store.write_results_text(GEOJSON, text)
-    written[PAGE] = write_page(store, PAGE, render_terrain(drawn))
-    return written

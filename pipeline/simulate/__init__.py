@@ -35,7 +35,7 @@ from pipeline.simulate.facts import (
 )
 from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
-from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
+from pipeline.simulate.path import SLOPE_EFFECTS
 from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, list_topics, publish
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
@@ -273,7 +273,7 @@ def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
     return 0.5 * uneven * rim, 0.0, -uneven * rim / vehicle.track_width_m
 
 
-_EXTRAS = {"oval_wheel": _ride_oval_wheel, "compacted_snow": CompactedGround(0.3, 0.88, 4.0)}
+_EXTRAS = {"oval_wheel": _ride_oval_wheel}
 
 
 def _change(base: Made, changes: Mapping[str, Any]) -> Made:

@@ -129,9 +129,6 @@ WORDS: list[tuple[str, str]] = [
     ("fleet trend --threshold inf", "inf is not a threshold"),
     ("fleet show", "fleet fit"),
     ("fleet predict --vehicle jackal --terrain ice", "no run of jackal"),
-    ("fleet map --cell 3", "Add --terrain"),
-    ("fleet map --terrain --cell .01", r"a cell of 0\.01 m is not possible"),
-    ("fleet map --terrain --figures svg", "--figures is of the map of deployments"),
     ("fleet map merge missing.parquet text.mcap --file map.parquet", "missing.parquet"),
     *(
         (f"{verb} --results nowhere", "nowhere: there are no results: there is no such folder. Give")
