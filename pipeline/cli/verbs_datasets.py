@@ -1,4 +1,4 @@
-"""Commands that set datasets side by side: compare, fleet map, fleet share."""
+"""Commands that set datasets side by side: compare, fleet map."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
 from pipeline import datasets, words
 from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
@@ -19,6 +19,7 @@ from pipeline.core import (
     format_share,
     format_two,
     split_interval,
+    suffix_unit,
 )
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def compare(  # noqa: D417 - arguments document themselves
     """Compare datasets: which is harder, as driven and at equal driving.
 
     The unit of the tests is the run.
-    Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
+    Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, features.parquet and comparison.html.
 
     Args:
         as_published: compare 2 s window norms, as published, in place of median slip moduli.
@@ -235,19 +236,11 @@ def _format_pairs(answer: datasets.Answer, name: str) -> list[str]:
     return [*lines, f"... and {omitted} more pairs on the page"] if omitted > 0 else lines
 
 
-def build_map() -> App:
-    """The verb and its command."""
-    verb = App(name="map", help="Draw deployments by kinetic energy and terrain complexity.")
-    verb.default(draw)
-    verb.command(merge)
-    return verb
-
-
 def draw(  # noqa: D417 - arguments document themselves
     results: Results = Path("results"),
     *,
     deployments: Annotated[
-        Path | None, Parameter(help="table of deployments in place of the project's own")
+        Path | None, Parameter(help="table of deployments (CSV) in place of the project's own")
     ] = None,
     fed: Annotated[
         Literal["command", "measured"] | None,
@@ -257,27 +250,25 @@ def draw(  # noqa: D417 - arguments document themselves
         Literal["slip", "relative", "energy", "unpredictability", "transitory"],
         Parameter(help="the measure of difficulty that colours own datasets"),
     ] = "slip",
-    shared: Annotated[
-        Path | None, Parameter(help="features of others, as slip fleet share writes them, to draw as well")
-    ] = None,
     figures: FigureFormat | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Write map.html: the literature, with the datasets of the results coloured by their slip.
+    """Draw deployments of the literature and own datasets by kinetic energy and terrain complexity.
+
+    Writes map.html.
 
     Args:
         figures: also write the figure in this format, for papers.
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
+    from pipeline.report.datasets_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
     store = Store(results) if results == Path("results") else open_results(results).open_store()
-    features = None if shared is None else datasets.read_features(shared)
-    drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show, shared=features)
+    drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show)
     page = write_map(store, drawn, figures)
     content = {
         "deployments": drawn.points.to_dicts(),
@@ -287,75 +278,16 @@ def draw(  # noqa: D417 - arguments document themselves
         "notes": list(drawn.notes),
         "page": str(page),
     }
+    unit = suffix_unit(drawn.measure.unit)
     lines = [
         f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
-        f"{drawn.measure.name} {_format_value(row['value'], drawn.measure.unit)}   {row['zone']} risk"
-        for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
+        f"{drawn.measure.name} {format_value(row['value'])}{unit}"
+        for row in drawn.own.iter_rows(named=True)
     ]
-    if lines:
-        bounds = ", ".join(f"{name} below {end:g}" for name, end in datasets.ZONES[:-1])
-        lines.append(
-            f"risk    by log10(energy / J) + complexity / 10: {bounds}, {datasets.ZONES[-1][0]} above"
-        )
-    placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
+    total = drawn.points.height + len(drawn.missing)
     lines += [f"! {note}" for note in drawn.notes]
-    lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")
-    return print_result(content, lambda: lines, json=json, quiet=quiet)
-
-
-def _format_value(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
-
-
-def merge(  # noqa: D417 - arguments document themselves
-    first: Annotated[Path, Parameter(help="features of deployments (Parquet)")],
-    second: Annotated[Path, Parameter(help="others")],
-    /,
-    *,
-    file: Annotated[Path, Parameter(help="file to write; may be one of them")] = Path("features.parquet"),
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Merge two files of `slip fleet share`.
-
-    What stands in both counts once. Contradictions are refused, and so is a file that is not what it should
-    be.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    merged, twice = datasets.merge_features(
-        [datasets.read_features(path) for path in (first, second)], f"{first} and {second}"
+    lines.append(
+        f"page    {page}    ({drawn.points.height} of {total} deployments placed; "
+        f"{drawn.measure.name} {INPUT_WORDS[drawn.input]})"
     )
-    datasets.write_features(merged, file)
-    runs = merged["sha256"].n_unique()
-    content = {"file": str(file), "runs": runs, "rows": merged.height, "twice": twice}
-    line = f"{file}: {runs} runs, {merged.height} rows, {twice} duplicates"
-    return print_result(content, lambda: [line], json=json, quiet=quiet)
-
-
-def share(  # noqa: D417 - arguments document themselves
-    results: Results = Path("results"),
-    *,
-    file: Annotated[Path, Parameter(help="file to write")] = Path("features.parquet"),
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Write features of every run to a file that can be shared.
-
-    The file contains no raw data, no file names and no places.
-    `slip fleet map merge` merges such files, `slip fleet map --shared` draws them.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-
-    features, notes = datasets.gather_features(Store(results))
-    datasets.write_features(features, file)
-    runs = features["sha256"].n_unique()
-    content = {"file": str(file), "runs": runs, "rows": features.height, "notes": list(notes)}
-    lines = [f"{file}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
     return print_result(content, lambda: lines, json=json, quiet=quiet)

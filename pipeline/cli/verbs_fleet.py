@@ -194,12 +194,12 @@ _SPREADS = (
 
 def build_fleet() -> App:
     """The command and its own commands."""
-    from pipeline.cli.verbs_datasets import build_map, share  # noqa: PLC0415 - only for this command
+    from pipeline.cli.verbs_datasets import draw  # noqa: PLC0415 - only for this command
 
     app = App(name="fleet", help="Fit, predict and follow the runs of a fleet; draw its map.")
-    for command in (fit, show, predict, trend, share):
+    for command in (fit, show, predict, trend):
         app.command(command)
-    app.command(build_map())
+    app.command(draw, name="map")
     return app
 
 

@@ -42,12 +42,10 @@ if TYPE_CHECKING:
     from pipeline.datasets.compare import compare_results
     from pipeline.datasets.compared_runs import NOT_VALID, Question, find_material, read_digest
     from pipeline.datasets.deployments import (
-        ZONES,
         DeploymentMap,
         draw_up_map,
     )
     from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
-    from pipeline.datasets.features import gather_features, merge_features, read_features, write_features
     from pipeline.datasets.forecast import FleetModel, Forecast, expect_values, forecast_vehicle, list_held
     from pipeline.datasets.pairs import (
         ABOUT_BLOCKS,

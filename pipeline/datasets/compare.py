@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, format_count, group_by
+from pipeline.core import FEWEST_OF_SPREAD, format_count, group_by, read_version
 from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
@@ -19,6 +19,7 @@ from pipeline.datasets.compared_runs import (
     find_untested,
     measure_runs,
     note_untested,
+    read_digest,
 )
 from pipeline.datasets.equal_driving import Levelled, Overlap, find_overlap, level_runs, measure_bins
 from pipeline.datasets.pairs import (
@@ -41,8 +42,11 @@ from pipeline.datasets.pooling import OVER_RUNS, THIS_RUN, pool_runs, spread_win
 from pipeline.datasets.published_chain import follow_published, read_limits
 from pipeline.datasets.rank_tests import Interval, connect_groups
 from pipeline.store import ANALYZE_FIRST, Store, lack_runs
+from schemas import contract_of
 
 _FEWEST = 2
+_HASH = 64
+"""Characters of a SHA-256 in hexadecimal."""
 
 _NORMS = ("windows", "t_start", "window_norm")
 """Table and columns of the 2 s window norms."""
@@ -289,6 +293,7 @@ class _Material:
             bins=bins,
             carriers=_find_carriers(self.compared, [view.input for view in views]),
             windows=spread_windows(windows, labels),
+            features=_list_features(self.compared, self.runs),
             notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
         )
 
@@ -419,6 +424,21 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str
             f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"
         )
     return sentences
+
+
+def _list_features(compared: ComparedRuns, runs: pl.DataFrame) -> pl.DataFrame:
+    """The table `features`: what can be given away of the runs, whose logs are known by their hash alone."""
+    digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}
+    sha256 = pl.col("run").replace_strict(digests, return_dtype=pl.String)
+    named = runs.with_columns(sha256.alias("sha256")).filter(pl.col("sha256").str.len_chars() == _HASH)
+    given = named.with_columns(
+        pl.col("sha256").str.slice(0, 16).alias("run"),
+        pl.lit(read_version()).alias("made_by"),
+        pl.col("key").alias("from_results"),
+        (pl.col("mass") * pl.col("squared_gyration")).alias("inertia"),
+    )
+    schema = contract_of("features").schema.create_empty().schema
+    return given.select(pl.col(name).cast(kind) for name, kind in schema.items()).sort("sha256", "input")
 
 
 def _tabulate_windows(samples: Mapping[str, Samples], input_name: str) -> pl.LazyFrame:

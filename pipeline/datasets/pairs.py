@@ -450,6 +450,7 @@ class Answer:
         runs: one row per run and input with all its measures.
         bins: the driving of every dataset: as from `measure_bins`, with ``group`` in place of the run.
         carriers: the cause that carries the difference of a pair as driven, by input and pair.
+        features: table `features`: what can be given away of the runs.
         windows: box plot statistics of the window norms, as from `spread_windows`.
         notes: excluded runs, pairs that cannot be distinguished.
     """
@@ -461,6 +462,7 @@ class Answer:
     bins: pl.DataFrame
     carriers: Mapping[tuple[str, frozenset[str]], str]
     windows: pl.DataFrame
+    features: pl.DataFrame
     notes: tuple[str, ...]
 
     @property

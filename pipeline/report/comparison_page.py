@@ -529,7 +529,7 @@ def _rate(shown: pl.DataFrame) -> pl.DataFrame:
 
 
 def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:
-    """Write `datasets.parquet`, `comparisons.parquet`, CSV and LaTeX tables and `comparison.html`.
+    """Write `datasets`, `comparisons` and `features`, their CSV and LaTeX tables, and `comparison.html`.
 
     Where figures cannot be drawn, the page is left out.
 
@@ -545,6 +545,7 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
         SlipError: figures were asked for, and what draws them is not installed.
     """
     store.write_results_table("datasets", answer.datasets)
+    store.write_results_table("features", answer.features)
     comparisons = pl.concat([view.comparisons for view in answer.views])
     store.write_results_table("comparisons", comparisons)
     written: dict[str, Path] = {}

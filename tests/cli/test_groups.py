@@ -16,7 +16,6 @@ MOVED = {
     "predict": "fleet predict",
     "trend": "fleet trend",
     "map": "fleet map",
-    "share": "fleet share",
     "status": "results status",
     "verify": "results verify",
     "explain": "results explain",
@@ -56,7 +55,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
     options = {words: list_options(app) for words, app in list_apps(build_app())}
     without = {words for words, names in options.items() if names and "--results" not in names}
     assert without == {
-        "batch schedule", "effects", "fleet map merge", "model new", "model new-effect",
+        "batch schedule", "effects", "model new", "model new-effect",
         "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
     }  # fmt: skip
     for names in options.values():

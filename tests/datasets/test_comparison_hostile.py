@@ -14,7 +14,7 @@ from pipeline.datasets.deployments import draw_up_map
 from pipeline.datasets.trend import follow_trend
 from pipeline.report import render_catalogue
 from pipeline.report.comparison_page import write_answer
-from pipeline.report.map_page import write_map
+from pipeline.report.datasets_page import write_map
 from pipeline.report.trend_page import write_trend
 from pipeline.store import Store
 

@@ -1,5 +1,6 @@
 """`slip compare` over results: what is said about good and bad input."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -210,3 +211,19 @@ def test_simulated_runs_are_never_pooled_with_recordings(store: Store) -> None:
     assert mixed.datasets["runs"].to_list() == [3, 3]
     assert all(row["keys"].split()[0].startswith("r") for row in mixed.datasets.iter_rows(named=True))
     assert "left out, simulated, and never pooled with recordings (3 runs): s0, s1, s2" in mixed.notes
+
+
+def test_features_can_be_given_away_and_put_together(store: Store) -> None:
+    for number, terrain in enumerate(("gravel", "ice")):
+        one = Run(name=f"secret_farm/{number}", dataset=f"warthog_{terrain}", terrain=terrain)
+        write_run(store, replace(one, sha256=f"{number}" * 64))
+    write_answer(store, ask(store))
+    path = store.root / "features.parquet"
+    assert b"secret_farm" not in path.read_bytes()
+    features = pl.read_parquet(path)
+    aggregates = store.read("secret_farm/0", "aggregates").filter(
+        pl.col("input") == "command", pl.col("subset") == "all"
+    )
+    own = features.filter(pl.col("sha256") == "0" * 64, pl.col("input") == "command")
+    assert own["median_modulus"].item() == aggregates["median_modulus"].item()
+    assert pl.concat([features, features]).unique(["sha256", "input"]).height == features.height == 4

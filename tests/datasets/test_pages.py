@@ -10,7 +10,7 @@ from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.datasets.deployments import draw_up_map
 from pipeline.datasets.trend import follow_trend
 from pipeline.report import lead_to
-from pipeline.report.map_page import write_map
+from pipeline.report.datasets_page import write_map
 from pipeline.report.trend_page import write_trend
 from pipeline.store import Store, see_log
 

@@ -129,12 +129,11 @@ WORDS: list[tuple[str, str]] = [
     ("fleet trend --threshold inf", "inf is not a threshold"),
     ("fleet show", "fleet fit"),
     ("fleet predict --vehicle jackal --terrain ice", "no run of jackal"),
-    ("fleet map merge missing.parquet text.mcap --file map.parquet", "missing.parquet"),
     *(
         (f"{verb} --results nowhere", "nowhere: there are no results: there is no such folder. Give")
         for verb in (
             "compare", "compare --causes", "fleet fit", "fleet show", "fleet trend", "fleet map",
-            "fleet share --file shared.parquet", "fleet predict --vehicle warthog --terrain ice",
+            "fleet predict --vehicle warthog --terrain ice",
             "results status", "results verify", "results query 'SELECT 1'", "batch --prune",
         )
     ),
