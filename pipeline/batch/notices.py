@@ -1,4 +1,4 @@
-"""What somebody should know after a batch: logs that failed, what changed over dates or against a baseline.
+"""What somebody should know after a batch: logs and steps that failed.
 
 Each is sent once, to a command of the user, and again only after a night without it.
 """
@@ -13,12 +13,7 @@ from pathlib import Path
 from pipeline.batch import BatchError
 from pipeline.batch.batch_run import Outcome
 from pipeline.core import SlipError, make_plain, shorten
-from pipeline.datasets import BROKEN, Baseline, Limits, check_runs, format_quiet, read_baseline, read_digest
-from pipeline.models import ModelFile, read_model
-from pipeline.report.trend_page import renew_trend
-from pipeline.sources import load_vehicle
-from pipeline.store import Manifest, Store
-from pipeline.words.check import format_verdict
+from pipeline.store import Store
 
 _NOTES = "batch/notified"
 _NOTE = "sent"
@@ -38,25 +33,10 @@ class Notice:
     Attributes:
         key: what it is; the same on another night.
         text: for people, one line.
-        is_alert: a change of the robot or of the data; else something failed.
     """
 
     key: str
     text: str
-    is_alert: bool = False
-
-
-@dataclass(frozen=True)
-class Looked:
-    """What was looked at after a batch.
-
-    Attributes:
-        lines: what came out, for people: a label and a text each.
-        notices: what somebody should know.
-    """
-
-    lines: tuple[tuple[str, str], ...] = ()
-    notices: tuple[Notice, ...] = ()
 
 
 def list_failures(outcome: Outcome) -> list[Notice]:
@@ -71,77 +51,6 @@ def note_error(error: Exception) -> Notice:
     if not isinstance(error, SlipError):
         return Notice(f"error {type(error)}", f"unexpected error: {error!r}")
     return Notice(f"error {error.code} {error.where}", str(error))
-
-
-def look_at_trend(root: Path) -> Looked:
-    """Follow the trend with the options of the last time; to have no dates is no failure."""
-    try:
-        trend = renew_trend(Store(root))
-    except SlipError as error:
-        if error.code == "nothing_to_follow":
-            return Looked((("trend", error.what),))
-        return Looked((("trend", str(error)),), (note_error(error),))
-    notices = [
-        Notice(f"trend {one.group} {one.quantity} {one.since}", one.text, is_alert=True)
-        for one in trend.alerts
-    ]
-    quiet = format_quiet(trend.series, trend.parameters)
-    return Looked(tuple(("trend", one.text) for one in notices) or (("trend", quiet),), tuple(notices))
-
-
-def open_reference(path: Path) -> ModelFile | Baseline:
-    """A model file, or a baseline that `slip check --keep` wrote.
-
-    Raises:
-        SlipError: it is neither, or it cannot be read.
-    """
-    if path.suffix not in {".json", ".toml"}:
-        hint = "Write one with slip check BEFORE AFTER --keep robot.json, or give a model file (robot.toml)."
-        raise BatchError("not_a_baseline", "a baseline or a model file is needed", where=str(path), hint=hint)
-    return read_baseline(path) if path.suffix == ".json" else read_model(path)
-
-
-def look_at_new_runs(
-    outcome: Outcome, root: Path, name: str, known: ModelFile | Baseline, limits: Limits | None
-) -> Looked:
-    """Check the runs that a batch made against a baseline of their vehicle.
-
-    Args:
-        outcome: what the batch did.
-        root: its results.
-        name: what the baseline is called.
-        known: the baseline.
-        limits: limits to judge by.
-    """
-    label = f"check {name}"
-    vehicle = (known.model if isinstance(known, Baseline) else known).model.vehicle
-    store = Store(root)
-    try:
-        new = _list_new(outcome, store, known)
-        if not new:
-            return Looked(((label, f"no new run of {vehicle.name}"),))
-        check = check_runs(known, new, store, limits=limits)
-    except SlipError as error:
-        return Looked(((label, str(error)),), (note_error(error),))
-    verdict = format_verdict(check)
-    if check.code != BROKEN:
-        return Looked(((label, verdict),))
-    named = [*check.list_status("changed"), *(one.name for one in check.limits if one.outcome == "broken")]
-    return Looked(
-        ((label, verdict),), (Notice(f"{label} {sorted(named)}", f"{name}: {verdict}", is_alert=True),)
-    )
-
-
-def _list_new(outcome: Outcome, store: Store, known: ModelFile | Baseline) -> list[Manifest]:
-    """Runs that the batch made, of the vehicle of a baseline and not in it."""
-    vehicle = (known.model if isinstance(known, Baseline) else known).model.vehicle
-    held = {one.sha256 for one in known.readings} if isinstance(known, Baseline) else set()
-    made = [store.manifest(line.run) for line in outcome.lines if line.state in {"done", "lossy"}]
-    return [
-        one
-        for one in made
-        if one is not None and load_vehicle(one).id == vehicle.id and read_digest(one) not in held
-    ]
 
 
 def send_news(
@@ -178,24 +87,13 @@ def compose(
     news: Sequence[Notice], as_before: int, report: Sequence[str], results: Path
 ) -> tuple[str, list[str]]:
     """Subject and lines of a message."""
-    counts = [
-        f"{count} {word}{'s' * (count != 1 and word != 'failed')}"
-        for word, count in (
-            ("failed", sum(not notice.is_alert for notice in news)),
-            ("alert", sum(notice.is_alert for notice in news)),
-        )
-        if count
-    ]
-    lines = [
-        f"{'alert' if notice.is_alert else 'failed':<8}{shorten(make_plain(notice.text), _LONGEST)}"
-        for notice in news
-    ]
+    lines = [f"failed  {shorten(make_plain(notice.text), _LONGEST)}" for notice in news]
     lines = [
         *lines[:_MOST_NOTICES],
         *([f"and {len(lines) - _MOST_NOTICES} more"] * (len(lines) > _MOST_NOTICES)),
     ]
     lines += [f"as before: {as_before}, reported already"] * bool(as_before)
-    subject = f"slip: {', '.join(counts)} ({make_plain(results.absolute().name)})"
+    subject = f"slip: {len(news)} failed ({make_plain(results.absolute().name)})"
     return subject, [*lines, "", *map(make_plain, report)]
 
 

@@ -31,7 +31,7 @@ class Nightly:
         lock: lock file that prevents a second instance.
         hour: hour of the day; local time for systemd and cron, UTC for the others.
         minute: minute of the hour.
-        notify: shell command that gets failures and alerts; None for none.
+        notify: shell command that gets failures; None for none.
     """
 
     program: Sequence[str]
@@ -116,10 +116,10 @@ def _fill_systemd(nightly: Nightly) -> dict[str, object]:
 def _fill_cron(nightly: Nightly) -> dict[str, object]:
     command = " ".join(_quote_cron(word) for word in nightly.guarded)
     if nightly.notify is not None:
-        # Failures (1) and alerts (4) were sent by the batch itself.
+        # Failures (1) were sent by the batch itself.
         subject, notify = _quote_cron(_DIED), _quote_cron(nightly.notify)
         send = f"echo {subject} | SLIP_SUBJECT={subject} SLIP_JSON={_quote_cron(_DIED_JSON)} sh -c {notify}"
-        command = f"{{ {command}; case $? in 0|1|3|4) ;; *) {send};; esac; }}"
+        command = f"{{ {command}; case $? in 0|1|3) ;; *) {send};; esac; }}"
     return {"line": f"cd {_quote_cron(str(nightly.folder))} && {command} 2>&1 | logger --tag slip-batch"}
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pipeline import datasets
 from pipeline.batch import (
     Pruning,
     Request,
@@ -23,7 +22,6 @@ from pipeline.batch import (
 )
 from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
-    ALERT,
     CLEAN,
     EXPLAINED,
     FAILED,
@@ -39,12 +37,11 @@ from pipeline.cli.conventions import (
     print_lines,
     summarize_error,
 )
-from pipeline.core import SlipError, align_rows, measure_memory, slip_command
+from pipeline.core import SlipError, measure_memory, slip_command
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Line, Outcome
-    from pipeline.batch.notices import Looked, Notice
-    from pipeline.models import ModelFile
+    from pipeline.batch.notices import Notice
 
 _MEMORY_SHARE = 0.8
 
@@ -58,45 +55,6 @@ def build_batch() -> App:
     return app
 
 
-@dataclass(frozen=True, kw_only=True)
-class Afterwards:
-    """What a batch does after its logs, and which command it notifies.
-
-    A command line of `notify` gets the message on its standard input and in its environment.
-    """
-
-    trend: Annotated[
-        bool, Parameter(help="follow the trend over dates afterwards, as `slip fleet trend` did last")
-    ] = False
-    check: Annotated[
-        tuple[Path, ...],
-        Parameter(help="a baseline or model file; new runs of its vehicle are checked against it"),
-    ] = ()
-    limits: Annotated[Path | None, Parameter(help="file of limits for --check (check.toml)")] = None
-    notify: Annotated[
-        str | None,
-        Parameter(
-            help="command line for the shell that gets new failures and alerts: the message on its "
-            "standard input, and $SLIP_SUBJECT, $SLIP_JSON"
-        ),
-    ] = None
-
-    def open_references(self) -> tuple[dict[str, ModelFile | datasets.Baseline], datasets.Limits | None]:
-        """The baselines by name, and the limits."""
-        if self.limits is not None and not self.check:
-            raise SlipError(
-                "limits_alone",
-                "--limits does nothing by itself",
-                hint="Add --check BASELINE, or leave it out",
-            )
-        if not self.check:
-            return {}, None
-        from pipeline.batch.notices import open_reference  # noqa: PLC0415 - heavy
-
-        opened = {str(path): open_reference(path) for path in self.check}
-        return opened, None if self.limits is None else datasets.read_limits(self.limits)
-
-
 def run(  # noqa: D417 - the shared choices document themselves
     logs: Annotated[
         list[str] | None,
@@ -105,7 +63,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
-    afterwards: Annotated[Afterwards, Parameter(name="*")] = Afterwards(),
+    notify: str | None = None,
     jobs: PositiveInt | None = None,
     executor: str = "local",
     shard: str | None = None,
@@ -124,8 +82,8 @@ def run(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Analyze the new and changed logs of a folder.
 
-    The same command again continues. Exit codes: 0 all done; 1 a log or a step failed; 4 an alert of --trend
-    or --check; 3 done, but a log had losses, cannot show slip, or could not be looked at.
+    The same command again continues. Exit codes: 0 all done; 1 a log or a step failed; 3 done, but a log had
+    losses, cannot show slip, or could not be looked at.
 
     Args:
         jobs: logs processed in parallel (default: the cores it may use).
@@ -141,6 +99,8 @@ def run(  # noqa: D417 - the shared choices document themselves
         prune: remove old generations afterwards; without logs, only that.
         keep: old generations to keep of each run.
         quota: with --prune, size of the results above which the oldest go first, for example 200GB.
+        notify: command line for the shell that gets new failures: the message on its standard input, and
+            $SLIP_SUBJECT, $SLIP_JSON.
         json: print one JSON object.
         quiet: print nothing but errors.
     """
@@ -174,90 +134,52 @@ def run(  # noqa: D417 - the shared choices document themselves
     from pipeline.batch.batch_run import run_batch  # noqa: PLC0415 - heavy
 
     try:
-        references = afterwards.open_references()
         with open_watch(quiet=quiet or json) as watch:
             outcome = run_batch(request, watch)
     except Exception as error:
         # No logs, a full disk: nobody looks at the screen of a night.
-        if afterwards.notify is not None:
+        if notify is not None:
             from pipeline.batch.notices import note_error, send_news  # noqa: PLC0415 - heavy
 
-            send_news(opened.root, afterwards.notify, [note_error(error)], [], code=FAILED)
+            send_news(opened.root, notify, [note_error(error)], [], code=FAILED)
         raise
     lines = format_outcome(outcome, is_search=bool(logs))
-    after = _look_after(outcome, opened.root, afterwards, references, lines)
-    for problem in (*outcome.problems, *after.problems):
+    code = FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
+    news, problems = ((), ()) if notify is None else _tell(outcome, opened.root, notify, lines, code)
+    for problem in (*outcome.problems, *problems):
         print_error(problem)
     if json:
-        print_json(_as_json(outcome, after))
+        print_json(_as_json(outcome, news, problems))
     elif not quiet:
-        print_lines([*lines, *after.lines])
-    return after.code
+        print_lines(lines)
+    return FAILED if problems else code
 
 
-@dataclass(frozen=True)
-class _After:
-    """What came after the logs: lines for the screen, exit code, what was sent, and why it was not."""
-
-    code: int
-    looked: Sequence[Looked] = ()
-    news: Sequence[Notice] = ()
-    problems: Sequence[SlipError] = ()
-
-    @property
-    def lines(self) -> list[str]:
-        pairs = [pair for one in self.looked for pair in one.lines]
-        return [*([""] * bool(pairs)), *align_rows(pairs)]
-
-
-def _look_after(
-    outcome: Outcome,
-    root: Path,
-    afterwards: Afterwards,
-    references: tuple[Mapping[str, ModelFile | datasets.Baseline], datasets.Limits | None],
-    lines: Sequence[str],
-) -> _After:
-    code = FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
-    if afterwards == Afterwards():
-        return _After(code)
+def _tell(
+    outcome: Outcome, root: Path, notify: str, lines: Sequence[str], code: int
+) -> tuple[Sequence[Notice], Sequence[SlipError]]:
+    """Send the news of a batch: what was sent, and why it was not."""
     from pipeline.batch import notices  # noqa: PLC0415 - heavy
 
-    looked = [notices.look_at_trend(root)] if afterwards.trend else []
-    looked += [
-        notices.look_at_new_runs(outcome, root, name, known, references[1])
-        for name, known in references[0].items()
-    ]
-    raised = [*notices.list_failures(outcome), *(each for one in looked for each in one.notices)]
-    if any(not each.is_alert for each in raised):
-        code = FAILED
-    elif raised:
-        code = ALERT
-    after = _After(code, looked)
-    if afterwards.notify is None:
-        return after
     try:
         # The counts alone: the notices say which logs failed.
         counts = lines[: lines.index("")] if "" in lines else lines
-        report = [*counts, *after.lines, "", f"page    {root.absolute() / 'index.html'}"]
-        news = notices.send_news(root, afterwards.notify, raised, report, code=code)
+        report = [*counts, "", f"page    {root.absolute() / 'index.html'}"]
+        return notices.send_news(root, notify, notices.list_failures(outcome), report, code=code), ()
     except SlipError as error:
-        return replace(after, code=FAILED, problems=[error])
-    return replace(after, news=news)
+        return (), (error,)
 
 
-def _as_json(outcome: Outcome, after: _After) -> dict[str, object]:
+def _as_json(outcome: Outcome, news: Sequence[Notice], problems: Sequence[SlipError]) -> dict[str, object]:
     states = [line.state for line in outcome.lines]
-    raised = [each for one in after.looked for each in one.notices]
     return {
         **outcome.counts,
         **{name: states.count(name) for name in ("growing", "left", "skipped")},
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
-        "after": [{"what": label, "text": text} for one in after.looked for label, text in one.lines],
-        "alerts": [each.text for each in raised if each.is_alert],
-        "notified": [each.text for each in after.news],
-        "errors": [summarize_error("", problem) for problem in (*outcome.problems, *after.problems)],
+        "notified": [each.text for each in news],
+        "errors": [summarize_error("", problem) for problem in (*outcome.problems, *problems)],
     }
 
 
@@ -292,7 +214,6 @@ def schedule(  # noqa: D417 - arguments document themselves
     print: Annotated[System, Parameter(name="--print")] = "systemd",  # noqa: A002 - the promised name
     at: Annotated[str, Parameter(name="--at")] = "02:00",
     lock: Annotated[Path | None, Parameter(name="--lock")] = None,
-    trend: Annotated[bool, Parameter(name="--trend", negative="--no-trend")] = True,
     notify: Annotated[str | None, Parameter(name="--notify")] = None,
 ) -> int:
     """Print a recipe that runs `slip batch` every night.
@@ -303,8 +224,7 @@ def schedule(  # noqa: D417 - arguments document themselves
     Args:
         print: systemd (a service and its timer), cron, airflow (a DAG) or github (a workflow of its Actions).
         at: time of day; local for systemd and cron, UTC for the others.
-        trend: follow the trend over dates after each batch.
-        notify: command line for the shell that gets new failures and alerts.
+        notify: command line for the shell that gets new failures.
         lock: lock file (default: .slip-batch.lock in this folder).
     """
     hour, minute = parse_clock(at)
@@ -318,7 +238,7 @@ def schedule(  # noqa: D417 - arguments document themselves
     folder = Path.cwd()
     nightly = Nightly(
         program=slip_command(),
-        arguments=(*(["--trend"] if trend else []), *arguments),
+        arguments=arguments,
         folder=folder,
         lock=(folder / (lock or ".slip-batch.lock")),
         hour=hour,

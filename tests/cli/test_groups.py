@@ -69,7 +69,7 @@ def test_no_option_has_a_negative_that_means_nothing() -> None:
         for name in list_options(app)
         if name.startswith(("--no-", "--empty-"))
     }
-    assert denied == {"--no-diagnosis", "--no-report", "--no-logs", "--no-trend"}
+    assert denied == {"--no-diagnosis", "--no-report", "--no-logs"}
     assert run_verb("effects", "--no-json").returncode == 2
 
 
@@ -92,7 +92,7 @@ def test_a_batch_has_its_verb_and_does_without(tmp_path: Path) -> None:
     again = run_verb("batch", "run", "logs", "--settle", 0, "--json", cwd=tmp_path)
     assert (first.returncode, again.returncode) == (0, 0)
     assert json.loads(first.stdout)["done"] == json.loads(again.stdout)["unchanged"] == 1
-    assert "batch run --trend logs" in run_verb("batch", "schedule", "logs", cwd=tmp_path).stdout
+    assert "batch run logs" in run_verb("batch", "schedule", "logs", cwd=tmp_path).stdout
 
 
 def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
