@@ -295,7 +295,7 @@ class Fleet(Table):
     ``run`` and ``dataset`` are `*`; ``keys`` names the runs.
     """
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     effect = name("id of the effect")
     parameter = name("name of the parameter")
@@ -310,8 +310,10 @@ class Fleet(Table):
     high = optional("1", "upper end of it")
     spread_terrain = optional("1", "standard deviation between terrains")
     spread_run = optional("1", "standard deviation between runs of a terrain")
-    chi_square = optional("1", "scatter of runs over what their errors say")
-    p_terrain = optional("1", "p value of equal terrains")
+    another_low = optional(
+        "1", "lower end of the 95 % band of another run: on another terrain, or on this one"
+    )
+    another_high = optional("1", "upper end of it")
     runs = count("runs behind the value", 1)
     named = count("runs whose diagnosis names the effect", nullable=True)
     keys = text("run/generation of every run counted, separated by spaces")

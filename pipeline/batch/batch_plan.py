@@ -371,22 +371,15 @@ def forget_pools(store: Store) -> None:
 def refresh_remote_pools(mirror: Mirror) -> None:
     """As `refresh_pools`, for results on an object store, including runs added by other machines.
 
-    A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
-    catalogue links them.
+    All pages are published, as the catalogue links them.
     """
-    from pipeline.datasets import FLEET, TREND  # noqa: PLC0415 - heavy
     from pipeline.report import PAGES  # noqa: PLC0415 - heavy
 
     mirror.pull_index()
-    tables = ["aggregates"]
-    if (mirror.store.root / FLEET).is_file():
-        tables += ["findings", "estimates"]
-    if (mirror.store.root / TREND).is_file():
-        tables += ["slip", "findings", "estimates"]
-    mirror.pull_tables(tables, mirror.store.manifests())
+    mirror.pull_tables(["aggregates"], mirror.store.manifests())
     forget_pools(mirror.store)
     refresh_pools(mirror.store)
-    for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
+    for name in ("datasets.parquet", "quarantine_datasets.parquet", *PAGES):
         mirror.push_file(mirror.store.root / name)
 
 
@@ -400,13 +393,7 @@ def _hash_runs(store: Store) -> str:
 
 
 def _write_pools(store: Store) -> None:
-    # A batch without work needs none of these imports.
-    from pipeline.report.fleet_pages import update_fleet  # noqa: PLC0415
-    from pipeline.report.trend_page import update_trend  # noqa: PLC0415
-
     update_datasets(store)
-    update_fleet(store)
-    update_trend(store)
 
 
 @dataclass(frozen=True, kw_only=True)

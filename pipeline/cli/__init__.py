@@ -60,7 +60,7 @@ _GROUPS = {
 _YOUNG = 20_000
 """Threshold of the garbage collector [new objects]: nearly all are freed without it, and it takes time."""
 _MOVED = {
-    **dict.fromkeys(("predict", "trend", "map"), "fleet"),
+    **dict.fromkeys(("trend", "map"), "fleet"),
     **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
     "schedule": "batch",
 }

@@ -91,7 +91,6 @@ if TYPE_CHECKING:
         INPUTS,
         JSON_DIGITS,
         NORMAL_95,
-        TREND_THRESHOLD,
         FigureFormat,
         SlipError,
         align_rows,

@@ -13,7 +13,6 @@ from pipeline.cli import build_app
 from pipeline.simulate import simulate_case
 
 MOVED = {
-    "predict": "fleet predict",
     "trend": "fleet trend",
     "map": "fleet map",
     "status": "results status",
