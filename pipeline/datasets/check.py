@@ -345,7 +345,7 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
 _TITLES = {
     POSITION_ERROR: "position error over 2 s",
     HEADING_ERROR: "heading error over 2 s",
-    COMMANDED_TURN: "share of the commanded yaw rate",
+    COMMANDED_TURN: "share of asked yaw rate",
     MULTIPLIER: "controller's multiplier",
 }
 

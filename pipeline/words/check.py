@@ -19,7 +19,7 @@ from pipeline.datasets import Check, Number
 Line = tuple[str, str]
 _MOST = 3
 """Numbers in a sentence; the table lists all."""
-_HEAD = ("", "number", "before", "after", "difference", "95 % interval", "runs differ by", "p")
+_HEAD = ("", "number", "before -> after", "difference [95 %]", "runs differ")
 _ONE_RUN = (
     "how much runs of this robot differ without a change is not known: three runs a side, or other runs, tell"
 )
@@ -81,14 +81,15 @@ def tabulate_check(check: Check) -> list[tuple[str, ...]]:
     rows = []
     for one in check.numbers:
         scale, unit = (100.0, " %") if one.is_ratio else (1.0, suffix_unit(one.unit))
-        difference, interval, spread, p = "", "", "", ""
+        difference, spread = "", ""
         if one.is_known:
             value, low, high = split_interval(*(scale * part for part in (one.difference, one.low, one.high)))
-            difference, interval = f"{'' if value.startswith('-') else '+'}{value}{unit}", f"{low} to {high}"
-            spread = f"{scale * one.spread:.2g}{unit}" if math.isfinite(one.spread) else "not known"
-            p = f"{one.p_adjusted:.2g}"
-        sides = (_format(one, one.before), _format(one, one.after))
-        rows.append((one.status, one.title, *sides, difference, interval, spread, p))
+            difference = f"{'' if value.startswith('-') else '+'}{value}{unit} [{low}, {high}]"
+            size = f"{scale * one.spread:.2g}{unit}" if one.spread else "by errors"
+            spread = size if math.isfinite(one.spread) else "not known"
+        before, after = _format(one, one.before), _format(one, one.after)
+        before = before.removesuffix(f" {after.partition(' ')[2]}")
+        rows.append((one.status, one.title, f"{before} -> {after}", difference, spread))
     return [_HEAD, *rows]
 
 

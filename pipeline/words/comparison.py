@@ -61,8 +61,8 @@ def _count(pairs: list[dict[str, object]]) -> str:
     if set(verdicts) <= {UNTESTED}:
         return "no pair can be tested"
     if OF_TWO_RUNS in verdicts and DIFFERENT not in verdicts:
-        count = f"{verdicts.count(OF_TWO_RUNS)} of {format_count(len(verdicts), 'pair')}"
-        return f"{count} differ, but as two single runs: more runs are needed to compare the grounds"
+        count = f"{verdicts.count(OF_TWO_RUNS)} of {format_count(len(verdicts), 'pair')} significant"
+        return f"{count}, but as two single runs: more runs are needed to compare the grounds"
     text = f"{verdicts.count(DIFFERENT)} of {format_count(len(verdicts), 'pair')} significant"
     return text + ": these runs do not tell them apart" * (set(verdicts) <= {ALIKE, UNTESTED})
 
