@@ -79,9 +79,9 @@ def compare(  # noqa: D417 - arguments document themselves
     question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
     store = Store(results)
     if causes:
-        found = find_causes(store, question)
-        written = write_causes(store, found, figures)
-        content, lines = found.to_json(), _format_causes(found, everything=everything)
+        compared = find_causes(store, question)
+        written = write_causes(store, compared, figures)
+        content, lines = compared.to_json(), _format_causes(compared, everything=everything)
     else:
         answer = compare_results(store, question)
         written = write_answer(store, answer, figures)
@@ -107,11 +107,11 @@ def _format_causes(causes: datasets.Causes, *, everything: bool) -> list[str]:
         parts = [f"{causes.names.get(one.name, one.name)} {format_share(one.value, 0)}" for one in shown]
         rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
         lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
-    told = [one.describe(causes.names) for one in causes.differences]
+    sentences = [one.describe(causes.names) for one in causes.differences]
     return [
         *lines,
         "",
-        *_shorten(told, "difference", everything=everything),
+        *_shorten(sentences, "difference", everything=everything),
         *_list_notes(causes.notes, everything),
     ]
 

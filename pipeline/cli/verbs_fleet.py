@@ -211,8 +211,8 @@ def _format_fleet(fleet: datasets.Fleet, *, everything: bool) -> list[str]:
                 if is_split
             ]
         lines += ["", f"{vehicle}: {format_count(len(runs), 'run')}", *align_rows(rows)] if own else []
-        more = len(own) - len(shown)
-        lines += [f"{format_count(more, 'more parameter')}: --all, or the page"] if more else []
+        hidden = len(own) - len(shown)
+        lines += [f"{format_count(hidden, 'more parameter')}: --all, or the page"] if hidden else []
         lines += [f"{one.label}: {one.name}, {one.because}" for one in shown if everything]
     return [*lines, *(f"! {note}" for note in fleet.notes)]
 

@@ -81,9 +81,9 @@ class Difference:
             for part in self.parts
             if abs(part.value) >= least > 0.0
         ]
-        tested = [part for part in self.parts if part.p_adjusted is not None]
-        sure = [names.get(one.name, one.name) for one in tested if (one.p_adjusted or 0.0) <= LEVEL]
-        end = f"significant: {', '.join(sure) or 'none'}" if tested else "too few runs for a test"
+        judged = [part for part in self.parts if part.p_adjusted is not None]
+        sure = [names.get(one.name, one.name) for one in judged if (one.p_adjusted or 0.0) <= LEVEL]
+        end = f"significant: {', '.join(sure) or 'none'}" if judged else "too few runs for a test"
         whole = f"{self.b} has {format_two(self.total)} m/s more RMS slip than {self.a}"
         return f"{whole}; by cause in m/s: {', '.join(texts) or 'none'}; {end}"
 
@@ -277,9 +277,9 @@ def _test(a: _Group, b: _Group, index: int) -> tuple[float, float | None, float 
     present, sign = (second, 1.0) if second.any() else (first, -1.0)
     if present.size < FEWEST_OF_SPREAD or np.ptp(present) == 0.0:
         return value, None, None, None
-    found = ttest_1samp(sign * present, 0.0)
-    ends = found.confidence_interval()
-    return value, float(ends.low), float(ends.high), float(found.pvalue)
+    test = ttest_1samp(sign * present, 0.0)
+    ends = test.confidence_interval()
+    return value, float(ends.low), float(ends.high), float(test.pvalue)
 
 
 def find_causes(store: Store, question: Question) -> Causes:

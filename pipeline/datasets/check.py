@@ -235,8 +235,8 @@ class Check:
         if self.list_status("changed"):
             return BROKEN
         unclear = [one for one in self.list_status("unclear") if one.name not in LOGARITHMS]
-        is_told = self.is_compared and not unclear and not self.list_status("differs")
-        return KEPT if is_told else UNDETERMINED
+        is_decided = self.is_compared and not unclear and not self.list_status("differs")
+        return KEPT if is_decided else UNDETERMINED
 
     def to_json(self, verdict: str, sentences: Sequence[str]) -> dict[str, object]:
         """The JSON object of `slip check`, with its verdict, and a sentence for each change."""
@@ -331,9 +331,9 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
             size = max(abs(before - neutral), abs(after - neutral), kind.usual_size)
             number = replace(number, before=before, after=after, size=size)
         numbers.append(number)
-    tested = [one for one in numbers if one.is_known]
-    adjusted = false_discovery_control([one.p for one in tested]) if tested else []
-    known = {one.name: float(p) for one, p in zip(tested, adjusted, strict=True)}
+    known_numbers = [one for one in numbers if one.is_known]
+    adjusted = false_discovery_control([one.p for one in known_numbers]) if known_numbers else []
+    known = {one.name: float(p) for one, p in zip(known_numbers, adjusted, strict=True)}
     judged = [replace(one, p_adjusted=known.get(one.name, math.nan)) for one in numbers]
     judged.sort(key=lambda one: (not one.is_known, one.p_adjusted, one.p if one.is_known else 0.0))
     check = Check(sides, tuple(judged))
@@ -389,11 +389,11 @@ def _compare(blank: Number, sides: Sides, *, simulated: bool, scale: float = 1.0
         spread=show(fit.spread) if is_known else math.nan,
         freedom=fit.freedom if is_known and not (simulated or is_set) else 0.0,
         p=one.p,
-        smallest=show(one.error * _find_reach(fit)),
+        smallest=show(one.error * _count_errors(fit)),
     )
 
 
-def _find_reach(fit: Levels) -> float:
+def _count_errors(fit: Levels) -> float:
     """Standard errors that a change must have to be shown with a probability of `_POWER`."""
     from scipy.stats import t  # noqa: PLC0415 - heavy
 
@@ -448,7 +448,7 @@ def _judge_number(number: Number, bound: Bound, sides: Sides) -> Iterator[Judged
         high = math.inf if bound.max is None else bound.max
         parts = [f"at least {bound.min:.3g}"] if bound.min is not None else []
         parts += [f"at most {bound.max:.3g}"] if bound.max is not None else []
-        yield Judged(number.name, f"{' and '.join(parts)}{unit}", text, _place(ends, low, high))
+        yield Judged(number.name, f"{' and '.join(parts)}{unit}", text, _judge_ends(ends, low, high))
     if bound.change is not None:
         known = math.isfinite(number.spread)
         ends = (number.low, number.high) if known else (math.nan, math.nan)
@@ -461,10 +461,10 @@ def _judge_number(number: Number, bound: Bound, sides: Sides) -> Iterator[Judged
             limit, low = f"change at most {bound.change:.3g} of {number.before:.3g}", -high
             text = f"{number.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}]{unit}"
         text = text if known else "how much runs differ is not known"
-        yield Judged(number.name, limit, text, _place(ends, low, high))
+        yield Judged(number.name, limit, text, _judge_ends(ends, low, high))
 
 
-def _place(ends: tuple[float, float], low: float, high: float) -> Outcome:
+def _judge_ends(ends: tuple[float, float], low: float, high: float) -> Outcome:
     if ends[0] >= low and ends[1] <= high:
         return "kept"
     return "broken" if ends[1] < low or ends[0] > high else "undetermined"

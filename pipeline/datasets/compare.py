@@ -226,8 +226,8 @@ class _Comparison:
             (str(row["note"]), f"{row['a']} and {row['b']}") for row in rows if row["p"] is None
         )
         for note, (first, *others) in sorted(silent.items()):
-            more = f", and {format_count(len(others), 'more pair')}" if others else ""
-            self.notes.append(f"{first}{more}, {QUANTITIES[quantity]}: {note}")
+            others_text = f", and {format_count(len(others), 'more pair')}" if others else ""
+            self.notes.append(f"{first}{others_text}, {QUANTITIES[quantity]}: {note}")
         single = sorted({str(row[k]) for row in rows if row["unit_of_analysis"] == BLOCKS for k in "ab"})
         if single:
             names = ", ".join(single)

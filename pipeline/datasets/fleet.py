@@ -186,7 +186,7 @@ def fit_fleet(estimates: pl.DataFrame) -> Fleet:
     known = estimates.filter(pl.col("terrain") != UNKNOWN)
     own = known.filter(pl.col("in_model") | pl.col("named"))
     label = pl.format("{}.{}", "effect", "parameter")
-    left = {
+    omitted = {
         "terrain unknown": estimates.filter(pl.col("terrain") == UNKNOWN)["run"],
         "at a bound of the search": own.filter("at_bound").select(label).to_series(),
         "outside the physical range": own.filter(~pl.col("at_bound"), ~_find_physical(own))
@@ -194,7 +194,9 @@ def fit_fleet(estimates: pl.DataFrame) -> Fleet:
         .to_series(),
     }
     notes = [
-        f"left out, {why}: {', '.join(which.unique().sort())}" for why, which in left.items() if which.len()
+        f"left out, {why}: {', '.join(which.unique().sort())}"
+        for why, which in omitted.items()
+        if which.len()
     ]
     numbers = [
         _fit_number(vehicle, effect, parameter, rows.filter(pl.col("in_model") | pl.col("named")))
@@ -259,7 +261,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     # Two grounds hardly show how much grounds differ.
     grounds = len(fit.names)
     further = math.hypot(pooled.spread, fit.spread, math.sqrt(pooled.variance))
-    reach = student_quantile(0.95, grounds - 1) * further if grounds >= FEWEST_OF_SPREAD else math.nan
+    half = student_quantile(0.95, grounds - 1) * further if grounds >= FEWEST_OF_SPREAD else math.nan
     return FleetNumber(
         effect=effect,
         parameter=parameter,
@@ -272,7 +274,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
         whole=Band(
             pooled.value,
             *_cut(number, (pooled.low, pooled.high)),
-            *_cut(number, (pooled.value - reach, pooled.value + reach)),
+            *_cut(number, (pooled.value - half, pooled.value + half)),
             rows.height,
         ),
         spread_terrain=spread,
@@ -387,9 +389,9 @@ def expect_run(
         ComparisonError: ``no_such_vehicle``: no other run of the vehicle on a known terrain has estimates.
     """
     compared = find_material(store, ("vehicle",), trusted_only=True, tables=("estimates",), vehicle=vehicle)
-    kept = [run for run, manifest in compared.manifests.items() if read_digest(manifest) not in without]
-    estimates = compared.read_estimates() if kept else tabulate("estimates", [])
-    known = estimates.filter(pl.col("run").is_in(kept)) if kept else estimates
+    runs = [run for run, manifest in compared.manifests.items() if read_digest(manifest) not in without]
+    estimates = compared.read_estimates() if runs else tabulate("estimates", [])
+    known = estimates.filter(pl.col("run").is_in(runs)) if runs else estimates
     return expect_numbers(known, vehicle, terrain, source)
 
 

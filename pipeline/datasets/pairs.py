@@ -162,12 +162,12 @@ def compare_groups(
         unit = RUNS if any(one.values.size > 1 or not one.runs for one in own) else BLOCKS
         units = [one.values for one in own] if unit == RUNS else _cut_alike([one.runs[0] for one in own])
         # A single run tells a spread by its own parts only: one with too few of them is not tested.
-        tested = [k for k, one in enumerate(units) if unit == RUNS or one.size >= FEWEST_OF_SPREAD]
+        able = [k for k, one in enumerate(units) if unit == RUNS or one.size >= FEWEST_OF_SPREAD]
         fit = None
-        if tested:
-            values = [units[k] for k in tested]
+        if able:
+            values = [units[k] for k in able]
             fit = _fit_levelled(own, levelled[own[0].name]) if levelled else _fit_logarithms(values)
-        names = {k: f"{number:06d}" for number, k in enumerate(tested)}
+        names = {k: f"{number:06d}" for number, k in enumerate(able)}
         for i, j in pairs:
             if i in family:
                 k, m = family.index(i), family.index(j)

@@ -135,9 +135,11 @@ def find_steps(series: Sequence[Series]) -> list[Series]:
     from scipy.stats import false_discovery_control  # noqa: PLC0415 - heavy
 
     stepped = [replace(one, step=_find_step(one.points)) for one in series]
-    tested = [one for one in stepped if one.step is not None]
-    adjusted = false_discovery_control([one.step.p for one in tested if one.step]) if tested else []
-    by_series = {id(one): float(p) for one, p in zip(tested, adjusted, strict=True)}
+    judged_series = [one for one in stepped if one.step is not None]
+    adjusted = (
+        false_discovery_control([one.step.p for one in judged_series if one.step]) if judged_series else []
+    )
+    by_series = {id(one): float(p) for one, p in zip(judged_series, adjusted, strict=True)}
     judged = [
         replace(one, step=replace(one.step, p_adjusted=by_series[id(one)])) if one.step else one
         for one in stepped
@@ -165,12 +167,12 @@ def _find_step(points: pl.DataFrame) -> Step | None:
         return scores
 
     ranks = rankdata(rest)
-    found = permutation_test(
+    test = permutation_test(
         (ranks,), lambda data, axis: weigh(data, axis).max(axis=-1), permutation_type="pairings",
         alternative="greater", vectorized=True, n_resamples=_DRAWS, rng=np.random.default_rng(0),
     )  # fmt: skip
     first = int(before[int(np.argmax(weigh(ranks)))])
     run, since = several["run"][first], several["day"][first]
     return Step(
-        str(run), str(since), float(rest[:first].mean()), float(rest[first:].mean()), float(found.pvalue)
+        str(run), str(since), float(rest[:first].mean()), float(rest[first:].mean()), float(test.pvalue)
     )
