@@ -145,7 +145,7 @@ def measure_paper(asked: Asked) -> dict[str, object]:
     for name in _PUBLISHED:
         analyze_log(RECORDINGS / f"{name}.mcap", Options(out=store.root, report=False))
     answer = compare_results(store, Question(by=("run",), as_published=True))
-    found = {row["dataset"].rsplit("/", 1)[-1]: row for row in answer.views[0].levels.to_dicts()}
+    found = {row["dataset"].rsplit("/", 1)[-1]: row for row in answer.levels.to_dicts()}
     rows = [
         {"name": name, "paper": paper, "derived": derived, **round_interval(found[log])}
         for log, (name, paper, derived) in _PUBLISHED.items()

@@ -295,7 +295,7 @@ class Fleet(Table):
     ``run`` and ``dataset`` are `*`; ``keys`` names the runs.
     """
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     effect = name("id of the effect")
     parameter = name("name of the parameter")
@@ -310,8 +310,10 @@ class Fleet(Table):
     high = optional("1", "upper end of it")
     spread_terrain = optional("1", "standard deviation between terrains")
     spread_run = optional("1", "standard deviation between runs of a terrain")
-    chi_square = optional("1", "scatter of runs over what their errors say")
-    p_terrain = optional("1", "p value of equal terrains")
+    another_low = optional(
+        "1", "lower end of the 95 % band of another run: on another terrain, or on this one"
+    )
+    another_high = optional("1", "upper end of it")
     runs = count("runs behind the value", 1)
     named = count("runs whose diagnosis names the effect", nullable=True)
     keys = text("run/generation of every run counted, separated by spaces")
@@ -490,30 +492,3 @@ class Deployments(dy.Schema):
         names = ("slope_score", "roughness_score", "sinkage_score", "friction_score")
         known = sum((pl.col(name).is_not_null().cast(pl.Int64) for name in names), pl.lit(0))
         return known.is_in([0, 4])
-
-
-class Cells(Table):
-    """One row a frame, vehicle and cell of the map of what to expect; ``run`` is `*`.
-
-    ``dataset`` and ``terrain`` are `*` where several were driven in a cell.
-    """
-
-    VERSION: ClassVar[int] = 1
-
-    frame = name("in which x and y are: a place on Earth, a map that runs share, or one run's own")
-    input = source()
-    cell = bounded("m", "side of the cell", 0.0)
-    x = number("m", "middle of the cell, east on Earth", frame="map")
-    y = number("m", "middle of the cell, north on Earth", frame="map")
-    latitude = optional("deg", "of the middle; null in a frame that is not on Earth")
-    longitude = optional("deg", "of the middle; null in a frame that is not on Earth")
-    passes = count("crossings of the cell by all runs", 1)
-    runs = count("runs that crossed it", 1)
-    slip = bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
-    slip_low = optional("1", "lower quartile of it over crossings; null of a single one")
-    slip_high = optional("1", "upper quartile")
-    modulus = bounded("m/s", "slip modulus, median over crossings", 0.0)
-    energy = optional("J", "kinetic energy of the slip velocity, median; null without a mass")
-    lean = optional("rad", "inclination of the vehicle, median; null where it was not measured")
-    power = optional("W", "drawn from the battery, median; null where the log does not say")
-    keys = text("run/generation of every run counted, separated by spaces")

@@ -76,26 +76,8 @@ def draw_pictures(folder: Path) -> list[Path]:
                 chrome.picture(frames[-1])
         shutil.copy(frames[2], folder / "workbench.png")
         (folder / "falling.png").write_bytes(join_frames([frame.read_bytes() for frame in frames], FRAME_MS))
-        _draw_terrain(chrome, Path(work), folder / "terrain.png")
-    names = ("report.png", "workbench.png", "falling.png", "terrain.png")
+    names = ("report.png", "workbench.png", "falling.png")
     return [folder / name for name in names]
-
-
-def _draw_terrain(chrome: Chrome, work: Path, picture: Path) -> None:
-    """The map of what to expect, of the drive that its page of the handbook simulates."""
-    results, log = work / "terrain", work / "laps" / "morning.mcap"
-    simulate = [SLIP, "simulate", "husky_laps_on_snow", "--seed", "1", "--file", log]
-    quick = ["--no-report", "--no-diagnosis", "--quiet", "--results", results]
-    for words in (
-        simulate,
-        [SLIP, "analyze", log, "--terrain", "snow", *quick],
-        [SLIP, "fleet", "map", "--terrain", "--quiet", "--results", results],
-    ):
-        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
-    chrome.size(WIDTH, HEIGHT)
-    chrome.open((results / "terrain.html").as_uri())
-    chrome.wait(DRAWN)
-    chrome.picture(picture)
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def write_verbs() -> str:
         (
             "`slip COMMAND --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says "
             "what to do; 2 usage; 3 done, but the log had losses or something could not be looked at, "
-            "which is listed; 4 an alert of `slip fleet trend`."
+            "which is listed; 4 a change that `slip check` found."
         ),
     ]
     shared = build_app().default_parameter

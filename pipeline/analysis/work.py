@@ -417,8 +417,6 @@ def key_stages(
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},
     }
-    if setup.configuration.run.map is not None:
-        own["extract"]["map"] = setup.configuration.run.map
     # A higher limit reads more of the log.
     unread = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
     if unread:

@@ -29,17 +29,13 @@ from pipeline.api.fitted_model import (
 )
 from pipeline.batch.recordings import list_named
 from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
+from pipeline.datasets import Check as RunsCheck
 from pipeline.datasets import (
-    Baseline,
-    check_as_json,
     check_runs,
     contest_models,
-    keep_baseline,
-    read_baseline,
     read_limits,
     read_runs,
 )
-from pipeline.datasets import Check as RunsCheck
 from pipeline.estimation import parse_budget
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis
 from pipeline.models import ModelFile, read_model
@@ -51,8 +47,8 @@ from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result, read_sug
 from pipeline.results import read_model as read_diagnosed_model
 from pipeline.sources import Owner, load_vehicle
 from pipeline.store import REPORT, Manifest, Store, find_run, read_choices
+from pipeline.words import check_as_json, diagnosis_as_json, format_junit, format_markdown, list_lines
 from pipeline.words import diagnosis as words
-from pipeline.words import diagnosis_as_json, format_junit, format_markdown, list_lines
 from schemas import contract_of
 
 if TYPE_CHECKING:
@@ -370,11 +366,20 @@ class Diagnosis:
         )
 
 
-_COLUMNS = {
-    **dict.fromkeys(("number", "unit", "status"), pl.String),
-    **dict.fromkeys(("before", "after", "low", "high", "p", "p_within_runs", "smallest_found"), pl.Float64),
-    "more_runs_a_side": pl.Int64,
-}
+_TEXTS = ("number", "unit", "status", "change_is")
+_NUMBERS = (
+    "before",
+    "after",
+    "difference",
+    "low",
+    "high",
+    "spread",
+    "freedom",
+    "p",
+    "p_adjusted",
+    "smallest",
+)
+_COLUMNS = {**dict.fromkeys(_TEXTS, pl.String), **dict.fromkeys(_NUMBERS, pl.Float64)}
 
 
 def check(
@@ -390,11 +395,11 @@ def check(
     """Check what changed between two drives, by cause, as `slip check` does.
 
     Args:
-        before: runs, logs, folders of logs, or a list of them; a model or its file; a baseline.
+        before: runs, logs, folders of logs, or a list of them; a model or its file.
         after: runs, logs, folders of logs, or a list of them.
         results: folder of results, where logs are analyzed once.
         limits: file of limits.
-        simulated: BEFORE is a simulation: the spread between runs does not count.
+        simulated: BEFORE is a simulation, whose runs do not differ.
         input: `command` or `measured`; None chooses.
         vehicle_of: geometry to use where vehicles differ.
     """
@@ -410,13 +415,11 @@ def check(
     return Check(checked)
 
 
-def _open_known(given: object) -> ModelFile | Baseline | None:
+def _open_known(given: object) -> ModelFile | None:
     if isinstance(given, Model):
         return given.file
     path = Path(given) if isinstance(given, str | Path) else Path()
-    if path.suffix == ".toml":
-        return read_model(path)
-    return read_baseline(path) if path.suffix == ".json" else None
+    return read_model(path) if path.suffix == ".toml" else None
 
 
 def _open_runs(given: object, store: Store, *, diagnosed: bool) -> list[Manifest]:
@@ -442,16 +445,17 @@ class Check:
 
     Attributes:
         verdict: what changed, and whether it is more than runs differ anyway.
-        numbers: one row each: ``number unit status before after low high p p_within_runs smallest_found
-            more_runs_a_side``; status is ``changed``, ``differs``, ``unchanged`` or ``unknown``.
+        numbers: one row each: ``number unit status change_is before after difference low high spread freedom
+            p p_adjusted smallest``; status is ``changed``, ``differs``, ``unclear``, ``unchanged`` or
+            ``unknown``.
         limits: one row each: ``name limit measured outcome``.
         code: 0 kept, 4 changed or broken, 3 undetermined.
     """
 
     def __init__(self, checked: RunsCheck) -> None:
-        self._checked, self._lines = checked, list_lines(checked)
-        content = check_as_json(checked, self._lines)
-        self.verdict, self.code = self._lines[0][1], checked.code
+        self._checked = checked
+        content = check_as_json(checked)
+        self.verdict, self.code = str(content["verdict"]), checked.code
         rows = [{key: row[key] for key in _COLUMNS} for row in objects_in(content, "numbers")]
         self.numbers = pl.DataFrame(rows, schema=_COLUMNS)
         names = ("name", "limit", "measured", "outcome")
@@ -460,7 +464,7 @@ class Check:
 
     def to_json(self) -> dict[str, object]:
         """The object of `slip check --json`."""
-        return check_as_json(self._checked, self._lines)
+        return check_as_json(self._checked)
 
     def to_markdown(self) -> str:
         """The text of `slip check --to markdown`."""
@@ -470,13 +474,9 @@ class Check:
         """The text of `slip check --to junit`."""
         return format_junit(self._checked)
 
-    def keep(self, path: str | Path) -> None:
-        """Write AFTER as a baseline that later runs are checked against, as `slip check --keep` does."""
-        keep_baseline(self._checked, Path(path))
-
     def __repr__(self) -> str:
-        return "\n".join(words.format_lines(list_lines(self._checked, everything=False)))
+        return "\n".join(words.format_lines(list_lines(self._checked)))
 
     def _repr_html_(self) -> str:
-        shown = self.numbers.select("number", "unit", "status", "before", "after", "p")
-        return write_html(self.verdict, shown, [text for label, text in self._lines if label == "note"])
+        shown = self.numbers.select("number", "unit", "status", "before", "after", "spread", "p_adjusted")
+        return write_html(self.verdict, shown, list(self._checked.sides.notes))

@@ -331,13 +331,7 @@ def _hash_runs(store: Store) -> str:
 
 
 def _write_pools(store: Store) -> None:
-    # A batch without work needs none of these imports.
-    from pipeline.report.fleet_pages import update_fleet  # noqa: PLC0415
-    from pipeline.report.trend_page import update_trend  # noqa: PLC0415
-
     update_datasets(store)
-    update_fleet(store)
-    update_trend(store)
 
 
 @dataclass(frozen=True, kw_only=True)

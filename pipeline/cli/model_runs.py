@@ -210,15 +210,14 @@ def cut_first(runs: Sequence[MotionRun], first_s: float) -> list[MotionRun]:
     return [cut_run(run, end_s=find_driven(run, first_s)) for run in runs]
 
 
-def forecast_runs(
+def expect_runs(
     runs: Sequence[MotionRun], vehicle: sources.Vehicle, source: Literal["command", "measured"], out: Path
-) -> datasets.Forecast:
+) -> datasets.Expected:
     """The fleet's prior on the ground of these runs, which themselves do not count.
 
     Raises:
         SlipError: there is no fleet; or ``several_terrains``.
     """
-    from pipeline.plan import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
@@ -231,7 +230,7 @@ def forecast_runs(
             hint="Fit the runs of each terrain separately.",
         )
     without = [run.sha256 for run in runs]
-    return forecast_deployment(Store(out), vehicle.id, terrains[0], source, without=without)
+    return datasets.expect_run(Store(out), vehicle.id, terrains[0], source, without=without)
 
 
 def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: bool) -> models.ModelFile:
@@ -245,18 +244,18 @@ def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: 
     vehicle, runs = gather_runs(names, None, None, out, quiet=quiet)
     chosen = choose_input(runs, source)
     return models.ModelFile(
-        models.Model(vehicle, forecast_runs(runs, vehicle, chosen.source.value, out).effects)
+        models.Model(vehicle, expect_runs(runs, vehicle, chosen.source.value, out).effects)
     )
 
 
 def tie_to_fleet(data: EstimationData, model: models.Model, out: Path) -> EstimationData:
-    """The data with the fleet's forecast as prior.
+    """The data with the fleet's numbers as prior.
 
     Raises:
-        SlipError: see `forecast_runs`.
+        SlipError: see `expect_runs`.
     """
-    forecast = forecast_runs(data.runs, model.vehicle, data.source.value, out)
-    return data.with_prior(forecast.prior)
+    expected = expect_runs(data.runs, model.vehicle, data.source.value, out)
+    return data.with_prior(expected.prior)
 
 
 def prior_as_json(data: EstimationData) -> dict[str, dict[str, object]]:

@@ -1,13 +1,12 @@
-"""Commands that set datasets side by side: compare, fleet map, fleet share."""
+"""Commands that set datasets side by side: compare, fleet map."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-from cyclopts import App, Parameter
-from cyclopts.types import PositiveFloat
+from cyclopts import Parameter
 
 from pipeline import datasets, words
 from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
@@ -15,16 +14,13 @@ from pipeline.core import (
     INPUT_WORDS,
     PACKAGE,
     FigureFormat,
-    SlipError,
     align_rows,
     format_count,
     format_share,
     format_two,
     split_interval,
+    suffix_unit,
 )
-
-if TYPE_CHECKING:
-    from pipeline.store import Store
 
 
 def compare(  # noqa: D417 - arguments document themselves
@@ -60,19 +56,19 @@ def compare(  # noqa: D417 - arguments document themselves
     """Compare datasets: which is harder, as driven and at equal driving.
 
     The unit of the tests is the run.
-    Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
+    Writes datasets.parquet, comparisons.parquet, both also as CSV, features.parquet and comparison.html.
 
     Args:
         as_published: compare 2 s window norms, as published, in place of median slip moduli.
         causes: compare budgets: which effects contribute to the slip, and which to the differences. Writes
-            causes.html, causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
+            causes.html, causes.csv and cause_differences.csv.
         figures: also write the figures in this format, for papers.
         everything: also print the tables of datasets and pairs, and all notes.
         json: print one JSON object in place of the lines.
         quiet: print nothing.
     """
-    from pipeline.datasets import Question, compare_results  # noqa: PLC0415 - heavy
-    from pipeline.report.comparison_page import write_answer  # noqa: PLC0415 - heavy
+    from pipeline.datasets import Question, compare_results, find_causes  # noqa: PLC0415 - heavy
+    from pipeline.report.datasets_page import write_answer, write_causes  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     # Alone or before datasets, a folder is that of the results.
@@ -83,127 +79,87 @@ def compare(  # noqa: D417 - arguments document themselves
     question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
     store = Store(results)
     if causes:
-        return _compare_causes(store, question, figures, everything=everything, json=json, quiet=quiet)
-    answer = compare_results(store, question)
-    written = write_answer(store, answer, figures)
-    content = {**words.summarize_answer(answer), "page": _find_page(written, "comparison.html")}
-    return print_result(
-        content, lambda: _format_answer(answer, written, everything=everything), json=json, quiet=quiet
-    )
+        compared = find_causes(store, question)
+        written = write_causes(store, compared, figures)
+        content, lines = compared.to_json(), _format_causes(compared, everything=everything)
+    else:
+        answer = compare_results(store, question)
+        written = write_answer(store, answer, figures)
+        content, lines = words.summarize_answer(answer), _format_answer(answer, everything=everything)
+    page = next((str(path) for name, path in written.items() if name.endswith(".html")), None)
+    lines.append(f"page    {page or _NO_PAGE}")
+    return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
+_NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"
+_MOST = 3
+"""Differences and notes on the screen without `--all`."""
+_MOST_PAIRS = 10
+"""Pairs on the screen, as many as five datasets have; the page has all."""
 _LEAST_SHARE = 0.01
 """Share of a budget from which on its cause is named on a screen; the page has all."""
 
 
-def _compare_causes(
-    store: Store,
-    question: datasets.Question,
-    figures: FigureFormat | None,
-    *,
-    everything: bool,
-    json: bool,
-    quiet: bool,
-) -> int:
-    from pipeline.report.fleet_pages import write_causes  # noqa: PLC0415 - heavy
-
-    causes = datasets.find_causes(store, question)
-    written = write_causes(store, causes, figures)
-    content, names = datasets.summarize_causes(causes), datasets.name_causes(causes.names)
+def _format_causes(causes: datasets.Causes, *, everything: bool) -> list[str]:
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
-        shown = [one for one in budget.parts if everything or abs(one.share) >= _LEAST_SHARE]
-        parts = [f"{names.get(one.name, one.name)} {format_share(one.share, 0)}" for one in shown]
-        others = 1.0 - sum(one.share for one in shown)
-        parts += [f"others {format_share(others, 0)}"] if abs(others) >= _LEAST_SHARE else []
+        shown = [one for one in budget.parts if everything or abs(one.value) >= _LEAST_SHARE]
+        parts = [f"{causes.names.get(one.name, one.name)} {format_share(one.value, 0)}" for one in shown]
         rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
         lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
-    lines += [""] * bool(causes.differences)
-    lines += datasets.list_differences(causes.differences if everything else causes.differences[:_FEW], names)
-    if not everything and len(causes.differences) > _FEW:
-        lines.append(f"{len(causes.differences) - _FEW} more differences (--all, page)")
-    page = _find_page(written, "causes.html")
-    lines += ["", *_list_notes(causes.notes, everything=everything), f"page    {page or _NO_PAGE}"]
-    return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
-
-
-_MOST_PAIRS = 10
-"""Pairs on the screen, as many as five datasets have; the page has all."""
-
-
-_FEW = 3
-"""Differences on the screen without `--all`."""
-_NOTES = 2
-"""Notes on the screen without `--all`."""
-
-
-def _list_notes(notes: Sequence[str], *, everything: bool) -> list[str]:
-    shown = notes if everything else notes[:_NOTES]
-    lines = [f"! {note}" for note in shown]
-    rest = format_count(len(notes) - len(shown), "more note")
-    return [*lines, f"  {rest} (--all, page)"] if len(notes) > len(shown) else lines
-
-
-def _format_answer(answer: datasets.Answer, written: Mapping[str, Path], *, everything: bool) -> list[str]:
-    from pipeline.words.comparison import list_lines  # noqa: PLC0415 - heavy
-
-    lines: list[str] = []
-    title = ""
-    for line in list_lines(answer):
-        if line.input != answer.input and not everything:
-            continue
-        if words.title_line(line) != title:
-            title = words.title_line(line)
-            lines += [""] * bool(lines) + [f"slip of {title}"]
-        lines.append(f"  {line.driving:<18}{line.text}")
-    for name in answer.inputs if everything else ():
-        lines += ["", *_format_datasets(answer, name), *_format_pairs(answer, name)]
-    orders = datasets.compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
-    sentences = [one.text for one in orders if one.tau is None or datasets.MEASURES[one.measure].unit == "1"]
-    lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
-    others = [INPUT_WORDS[name] for name in answer.inputs if name != answer.input]
-    rest = ", ".join([*others, "all datasets and pairs with intervals"])
-    lines += [] if everything else ["", f"{rest}: --all, or the page"]
-    notes = _list_notes(words.list_shown_notes(answer), everything=everything)
+    sentences = [one.describe(causes.names) for one in causes.differences]
     return [
         *lines,
-        *([""] if notes else []),
-        *notes,
-        f"page    {_find_page(written, 'comparison.html') or _NO_PAGE}",
+        "",
+        *_shorten(sentences, "difference", everything=everything),
+        *_list_notes(causes.notes, everything),
     ]
 
 
-_NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"
+def _shorten(lines: Sequence[str], what: str, *, everything: bool) -> list[str]:
+    """The lines, or the first ones and how many more there are."""
+    if everything or len(lines) <= _MOST:
+        return list(lines)
+    return [*lines[:_MOST], f"  {format_count(len(lines) - _MOST, f'more {what}')} (--all, page)"]
 
 
-def _find_page(written: Mapping[str, Path], name: str) -> str | None:
-    """A page that was written; None where figures cannot be drawn."""
-    return str(written[name]) if name in written else None
+def _list_notes(notes: Sequence[str], everything: bool) -> list[str]:  # noqa: FBT001 - as the option
+    lines = _shorten([f"! {note}" for note in notes], "note", everything=everything)
+    return ["", *lines] if lines else []
 
 
-def _format_datasets(answer: datasets.Answer, name: str) -> list[str]:
-    """Medians of the datasets on an input, as driven and at equal driving."""
-    driven, equal = (answer.find_view(name, equal=one) for one in (False, True))
-    if driven is None:
-        return []
-    counts = answer.datasets.filter(answer.datasets["input"] == name).select("dataset", "runs")
-    shown = driven.levels.join(counts, on="dataset").sort("value", "dataset")
-    levels = {row["dataset"]: row for row in equal.levels.iter_rows(named=True)} if equal else {}
-    table = [("dataset", "runs", "as driven", "95 % interval", "equal driving", "95 % interval")]
-    table += [
-        (
-            row["dataset"],
-            str(row["runs"]),
-            format_value(row["value"]),
-            _format_ends(row) + " (this run)" * (row["interval"] == "this run only"),
-            format_value(levels.get(row["dataset"], {}).get("value")),
-            _format_ends(levels.get(row["dataset"], {})),
-        )
-        for row in shown.iter_rows(named=True)
+def _format_answer(answer: datasets.Answer, *, everything: bool) -> list[str]:
+    lines: list[str] = []
+    title = ""
+    for head, about, text in words.list_answer(answer, main_only=not everything):
+        lines += ([""] * bool(lines) + [f"slip of {head}"]) * (head != title)
+        title = head
+        lines.append(f"  {about:<18}{text}")
+    for view in answer.views if everything else ():
+        about = f"{datasets.QUANTITIES[view[1]]}, {INPUT_WORDS[view[0]]}"
+        levels = [
+            (row["dataset"], format_value(row["value"]), _format_ends(row), row["interval"])
+            for row in answer.take(answer.levels, view).sort("value").iter_rows(named=True)
+        ]
+        pairs = [
+            (f"{row['b']} / {row['a']}", words.format_ratio(row, row["b"]), format_value(row["p_adjusted"]))
+            for row in answer.take(answer.comparisons, view)
+            .sort("p_adjusted", nulls_last=True)
+            .iter_rows(named=True)
+        ]
+        lines += ["", *align_rows([(f"{answer.measure} {about}", "m/s", "95 % interval", ""), *levels])]
+        lines += [
+            "",
+            *align_rows([("times as much slip", "ratio", "p adjusted"), *pairs[:_MOST_PAIRS]]),
+        ] * bool(pairs)
+        omitted = len(pairs) - _MOST_PAIRS
+        lines += [f"... and {omitted} more pairs on the page"] * (omitted > 0)
+    others = [
+        INPUT_WORDS[name] for name in dict.fromkeys(one for one, _ in answer.views) if name != answer.input
     ]
-    shown_columns = [row if levels else row[:4] for row in table]
-    head = f"{answer.measure} [m/s], {INPUT_WORDS[name]}"
-    return [head, *align_rows(shown_columns, right=(1, 2, 4), gap=3)]
+    rest = ", ".join([*others, "all datasets and pairs with intervals"])
+    lines += [] if everything else ["", f"{rest}: --all, or the page"]
+    return [*lines, *_list_notes(words.list_shown_notes(answer), everything)]
 
 
 def _format_ends(row: Mapping[str, object]) -> str:
@@ -213,43 +169,11 @@ def _format_ends(row: Mapping[str, object]) -> str:
     return " to ".join(split_interval(value, low, high)[1:])
 
 
-def _format_pairs(answer: datasets.Answer, name: str) -> list[str]:
-    """One line a pair, the surest first."""
-    rows = [
-        (
-            f"{pair.hard} / {pair.easy}",
-            f"{pair.driven}{'*' * pair.is_driven_sure}",
-            f"{pair.equal}{'*' * pair.is_equal_sure}",
-            pair.common,
-            pair.carrier,
-        )
-        for pair in words.list_pairs(answer, name)
-    ]
-    if not rows:
-        return []
-    head = ("times as much slip", "as driven", "equal driving", "in common", "carried by, as driven")
-    shown = [head, *rows[:_MOST_PAIRS]]
-    columns = [k for k in range(len(head)) if any(row[k] for row in shown[1:])]
-    lines = ["", *align_rows([[row[k] for k in columns] for row in shown])]
-    omitted = len(rows) - _MOST_PAIRS
-    marked = any("*" in text for row in rows[:_MOST_PAIRS] for text in row)
-    lines += ["* significant over all pairs of the vehicle"] if marked else []
-    return [*lines, f"... and {omitted} more pairs on the page"] if omitted > 0 else lines
-
-
-def build_map() -> App:
-    """The verb and its command."""
-    verb = App(name="map", help="Draw deployments by kinetic energy and terrain complexity.")
-    verb.default(draw)
-    verb.command(merge)
-    return verb
-
-
 def draw(  # noqa: D417 - arguments document themselves
     results: Results = Path("results"),
     *,
     deployments: Annotated[
-        Path | None, Parameter(help="table of deployments in place of the project's own")
+        Path | None, Parameter(help="table of deployments (CSV) in place of the project's own")
     ] = None,
     fed: Annotated[
         Literal["command", "measured"] | None,
@@ -259,140 +183,44 @@ def draw(  # noqa: D417 - arguments document themselves
         Literal["slip", "relative", "energy", "unpredictability", "transitory"],
         Parameter(help="the measure of difficulty that colours own datasets"),
     ] = "slip",
-    shared: Annotated[
-        Path | None, Parameter(help="features of others, as slip fleet share writes them, to draw as well")
-    ] = None,
-    terrain: bool = False,
-    cell: Annotated[
-        PositiveFloat | None, Parameter(help="side of a cell of --terrain [m] (default: 2)")
-    ] = None,
     figures: FigureFormat | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Write map.html: the literature, with the datasets of the results coloured by their slip.
+    """Draw deployments of the literature and own datasets by kinetic energy and terrain complexity.
 
-    With --terrain write terrain.html, cells.parquet and terrain.geojson: what to expect by place.
+    Writes map.html.
 
     Args:
-        terrain: map slip, energy, power and inclination by place, and slip by number of passes.
         figures: also write the figure in this format, for papers.
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
+    from pipeline.report.datasets_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    if terrain:
-        others = {
-            "--deployments": deployments is not None,
-            "--show": show != "slip",
-            "--shared": shared is not None,
-            "--figures": figures is not None,
-        }
-        for option, is_given in others.items():
-            if is_given:
-                what = f"{option} is of the map of deployments"
-                raise SlipError("wrong_options", what, hint="Leave out --terrain, or that option.")
-        return _draw_terrain(results, cell, fed, json=json, quiet=quiet)
-    if cell is not None:
-        raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
     store = Store(results) if results == Path("results") else open_results(results)
-    features = None if shared is None else datasets.read_features(shared)
-    drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show, shared=features)
-    page = write_map(store, drawn, figures)
+    drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show)
+    page = str(write_map(store, drawn, figures).get("map.html", _NO_PAGE))
     content = {
         "deployments": drawn.points.to_dicts(),
         "datasets": drawn.own.to_dicts(),
         "input": drawn.input,
         "measure": vars(drawn.measure),
         "notes": list(drawn.notes),
-        "page": str(page),
+        "page": page,
     }
+    unit = suffix_unit(drawn.measure.unit)
     lines = [
         f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
-        f"{drawn.measure.name} {_format_value(row['value'], drawn.measure.unit)}   {row['zone']} risk"
-        for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
+        f"{drawn.measure.name} {format_value(row['value'])}{unit}"
+        for row in drawn.own.iter_rows(named=True)
     ]
-    if lines:
-        bounds = ", ".join(f"{name} below {end:g}" for name, end in datasets.ZONES[:-1])
-        lines.append(
-            f"risk    by log10(energy / J) + complexity / 10: {bounds}, {datasets.ZONES[-1][0]} above"
-        )
-    placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
+    total = drawn.points.height + len(drawn.missing)
     lines += [f"! {note}" for note in drawn.notes]
-    lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")
-    return print_result(content, lambda: lines, json=json, quiet=quiet)
-
-
-def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
-    """Write the terrain map of slip by position."""
-    from pipeline.report.fleet_pages import write_terrain  # noqa: PLC0415 - heavy
-
-    store = open_results(results)
-    drawn = datasets.draw_up_terrain(store, cell_m=datasets.CELL_M if cell is None else cell, fed=fed)
-    written = write_terrain(store, drawn)
-    content = {
-        **datasets.describe_terrain(drawn),
-        "written": {name: str(path) for name, path in written.items()},
-    }
-    return print_result(content, lambda: datasets.list_lines(drawn, written), json=json, quiet=quiet)
-
-
-def _format_value(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
-
-
-def merge(  # noqa: D417 - arguments document themselves
-    first: Annotated[Path, Parameter(help="features of deployments (Parquet)")],
-    second: Annotated[Path, Parameter(help="others")],
-    /,
-    *,
-    file: Annotated[Path, Parameter(help="file to write; may be one of them")] = Path("features.parquet"),
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Merge two files of `slip fleet share`.
-
-    What stands in both counts once. Contradictions are refused, and so is a file that is not what it should
-    be.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    merged, twice = datasets.merge_features(
-        [datasets.read_features(path) for path in (first, second)], f"{first} and {second}"
+    lines.append(
+        f"page    {page}    ({drawn.points.height} of {total} deployments placed; "
+        f"{drawn.measure.name} {INPUT_WORDS[drawn.input]})"
     )
-    datasets.write_features(merged, file)
-    runs = merged["sha256"].n_unique()
-    content = {"file": str(file), "runs": runs, "rows": merged.height, "twice": twice}
-    line = f"{file}: {runs} runs, {merged.height} rows, {twice} duplicates"
-    return print_result(content, lambda: [line], json=json, quiet=quiet)
-
-
-def share(  # noqa: D417 - arguments document themselves
-    results: Results = Path("results"),
-    *,
-    file: Annotated[Path, Parameter(help="file to write")] = Path("features.parquet"),
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Write features of every run to a file that can be shared.
-
-    The file contains no raw data, no file names and no places.
-    `slip fleet map merge` merges such files, `slip fleet map --shared` draws them.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-
-    features, notes = datasets.gather_features(Store(results))
-    datasets.write_features(features, file)
-    runs = features["sha256"].n_unique()
-    content = {"file": str(file), "runs": runs, "rows": features.height, "notes": list(notes)}
-    lines = [f"{file}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
     return print_result(content, lambda: lines, json=json, quiet=quiet)

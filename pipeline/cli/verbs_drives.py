@@ -30,7 +30,7 @@ from pipeline.core import SlipError, align_rows, format_count, format_duration
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
-    from pipeline.datasets import Forecast
+    from pipeline.datasets import Expected
     from pipeline.plan import Plan
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
@@ -122,13 +122,13 @@ def plan(  # noqa: D417 - the runs document themselves
     files = write_drive(made, folder, results)
     shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
     if json:
-        written = {**_known_as_json(studied.forecast), "files": [str(file) for file in files], "errors": []}
+        written = {**_known_as_json(studied.expected), "files": [str(file) for file in files], "errors": []}
         print_json({**made.to_json(), **written})
     elif not quiet:
         driven_s = studied.knowledge.driven_s
         print_lines(
             [
-                *_format_known(studied.forecast),
+                *_format_known(studied.expected),
                 *format_plan(made, driven_s, files, said, wanted or (), everything=everything),
                 *shown,
             ]
@@ -151,19 +151,19 @@ def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) ->
     return [f"report       {shown} shows it"] if shown is not None else []
 
 
-def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
-    if forecast is None:
+def _known_as_json(expected: Expected | None) -> dict[str, object]:
+    if expected is None:
         return {}
-    there = {"terrain": forecast.terrain, "runs_on_terrain": len(forecast.here)}
-    return {"known": {**there, "runs_elsewhere": len(forecast.elsewhere)}}
+    there = {"terrain": expected.terrain, "runs_on_terrain": len(expected.here)}
+    return {"known": {**there, "runs_elsewhere": len(expected.elsewhere)}}
 
 
-def _format_known(forecast: Forecast | None) -> list[str]:
-    if forecast is None:
+def _format_known(expected: Expected | None) -> list[str]:
+    if expected is None:
         return []
-    here = f"{format_count(len(forecast.here), 'run')} there"
-    runs = f"{here}, {len(forecast.elsewhere)} elsewhere"
-    return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
+    here = f"{format_count(len(expected.here), 'run')} there"
+    runs = f"{here}, {len(expected.elsewhere)} elsewhere"
+    return [f"known        of {expected.vehicle} on {expected.terrain}: {runs}"]
 
 
 class _Gathered(NamedTuple):

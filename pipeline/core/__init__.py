@@ -92,7 +92,6 @@ if TYPE_CHECKING:
         LONGEST_NAME,
         LONGEST_TEXT,
         NORMAL_95,
-        TREND_THRESHOLD,
         FigureFormat,
         SlipError,
         align_rows,

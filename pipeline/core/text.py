@@ -132,9 +132,6 @@ INPUTS = ("command", "measured")
 INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 """Text for each input of the ideal model."""
 
-TREND_THRESHOLD = 0.1
-"""Relative change of slip that raises an alert of a trend unless another is given."""
-
 FigureFormat = Literal["svg", "pdf", "png"]
 FIGURES: tuple[FigureFormat, ...] = get_args(FigureFormat)
 

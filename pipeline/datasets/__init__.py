@@ -1,6 +1,7 @@
-"""Runs together: datasets and their differences, levels of parameters, forecasts, trends, maps, checks.
+"""Runs together, in one model: a value is a level of the vehicle, of the ground, and of the run.
 
-Input and output are tables. `rank_tests` holds the significance tests; pages are drawn by `pipeline.report`.
+`levels` is that model; comparisons, causes, levels of a fleet and checks are tables that it fills. Pages are
+drawn by `pipeline.report`.
 """
 
 from typing import TYPE_CHECKING
@@ -8,107 +9,22 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.datasets.causes import (
-        Budget,
-        Causes,
-        Difference,
-        find_causes,
-        list_differences,
-        name_causes,
-        summarize_causes,
-        tabulate_budgets,
-        tabulate_differences,
-    )
-    from pipeline.datasets.changes import Change
-    from pipeline.datasets.check import (
-        BROKEN,
-        Check,
-        Limits,
-        check_as_json,
-        check_runs,
-        find_pace,
-        keep_baseline,
-        read_limits,
-    )
-    from pipeline.datasets.check_readings import (
-        ERRORS,
-        HEADING_ERROR,
-        LOGARITHMS,
-        MULTIPLIER,
-        POSITION_ERROR,
-        Label,
-    )
-    from pipeline.datasets.check_sides import Baseline, read_baseline
-    from pipeline.datasets.compare import compare_results
-    from pipeline.datasets.compared_runs import NOT_VALID, Question, find_material, read_digest
-    from pipeline.datasets.deployments import (
-        ZONES,
-        DeploymentMap,
-        draw_up_map,
-    )
-    from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
-    from pipeline.datasets.features import gather_features, merge_features, read_features, write_features
-    from pipeline.datasets.forecast import FleetModel, Forecast, expect_values, forecast_vehicle, list_held
-    from pipeline.datasets.pairs import (
-        ABOUT_BLOCKS,
+    from pipeline.datasets.causes import Budget, Causes, find_causes
+    from pipeline.datasets.check import BROKEN, Check, Number, check_runs, read_limits
+    from pipeline.datasets.compare import (
         ABOUT_UNIT,
-        ALIKE,
-        AS_DRIVEN,
         AS_PUBLISHED,
-        DIFFERENT,
         EQUAL_DRIVING,
-        NO_SPREAD,
-        OF_TWO_RUNS,
-        UNTESTED,
+        QUANTITIES,
         Answer,
-        View,
-        compare_orders,
-        foresee_pairs,
-        judge_pair,
+        compare_results,
     )
-    from pipeline.datasets.pooling import (
-        MEASURES,
-        THIS_RUN,
-        WHISKER_REACH,
-        ComparisonError,
-        Measure,
-        gather_runs,
-        pool_runs,
-    )
-    from pipeline.datasets.prediction import (
-        FLEET,
-        find_estimates,
-        fit_results,
-        make_model_file,
-        predict_deployment,
-        read_fleet,
-        summarize_fleet,
-        summarize_prediction,
-        tabulate_fleet,
-    )
-    from pipeline.datasets.rank_tests import kendall_tau, list_swaps
+    from pipeline.datasets.compared_runs import NOT_VALID, Question, find_material
+    from pipeline.datasets.deployments import DeploymentMap, draw_up_map
+    from pipeline.datasets.fleet import Band, Expected, Fleet, FleetNumber, expect_run, fit_results
+    from pipeline.datasets.pairs import ALIKE, DIFFERENT, OF_TWO_RUNS, THIS_RUN, UNTESTED, judge_pair
+    from pipeline.datasets.pooling import MEASURES, ComparisonError, gather_runs, pool_runs
     from pipeline.datasets.stored_fits import ModelFit, contest_models, fit_to_runs, read_runs
-    from pipeline.datasets.terrain import CELL_M, SHARE_DIGITS, PassEffect, TerrainMap
-    from pipeline.datasets.terrain_map import (
-        GEOJSON,
-        PAGE,
-        describe_terrain,
-        draw_up_terrain,
-        list_features,
-        list_lines,
-    )
-    from pipeline.datasets.trend import (
-        TREND,
-        ParameterTrend,
-        Series,
-        Trend,
-        check_limits,
-        follow_trend,
-        format_change,
-        format_power,
-        format_quiet,
-        name_quantity,
-        summarize_trend,
-    )
+    from pipeline.datasets.trend import Series, Trend, follow_trend
 else:
     __getattr__ = open_door(__name__, __file__)

@@ -1,8 +1,8 @@
-"""Estimates of one run with the model of a check, and the logarithms that are compared beside them."""
+"""Estimates of one run with the model of a check, and what is compared beside them."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -17,90 +17,40 @@ from pipeline.core import (
     jackknife_deviation,
     student_quantile,
 )
-from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.estimation_data import EstimationData
-from pipeline.estimation.fit import fit_path
 from pipeline.estimation.intervals import estimate_path
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, Parameter, is_of_one_run
 from pipeline.run import MotionRun
 
-POSITION_ERROR = "error.position"
-
-
-HEADING_ERROR = "error.heading"
-
-
-ERRORS = (POSITION_ERROR, HEADING_ERROR)
-"""Logarithms of the errors over 2 s [m, rad] divided by the speed of the run [m/s]: a change of these is not
-explained by any parameter of the model."""
-
-
-COMMANDED_TURN = "commanded.turn"
-
-
-MULTIPLIER = "controller.multiplier"
-
-
-COMMANDED = (COMMANDED_TURN, MULTIPLIER)
-"""Logarithms of the share of the commanded yaw rate that the robot reaches, and of the multiplier of its
-controller: unknown without a body command."""
-
-
-LOGARITHMS = (*ERRORS, *COMMANDED)
-"""Quantities beside the parameters, in their order; all are compared as logarithms."""
-
-
-USUAL_LOG_RATIO = 0.4
-"""Root mean square of the prior of such a logarithm's spread between runs on one terrain: the spread of the
-Warthog recordings (`make bench NAME=check ARGS=real`)."""
-
-
-USUAL_LOG_SHARE = 0.18
-"""The same of the share of the commanded yaw rate: that of seven runs of a Warthog on three terrains."""
-
-
-MULTIPLIER_ERROR = 0.02
-"""Standard deviation of the logarithm of a side's multiplier that is measured by the wheels, however many
-runs it has: simulated runs of one controller differ by 0.01, and load and wear of real wheels, which all runs
-of a side share, do not average away."""
-
-
-USUAL_LOGARITHMS = {
-    POSITION_ERROR: USUAL_LOG_RATIO,
-    HEADING_ERROR: USUAL_LOG_RATIO,
-    COMMANDED_TURN: USUAL_LOG_SHARE,
-    MULTIPLIER: 0.0,
-}
-"""Root mean square of the prior of each spread between runs; a setting has none."""
-
-
+POSITION_ERROR, HEADING_ERROR = "error.position", "error.heading"
+ERRORS = {POSITION_ERROR: "m", HEADING_ERROR: "rad"}
+"""Errors over 2 s divided by the speed of the run, which no parameter of the model explains, and their
+units."""
+COMMANDED_TURN, MULTIPLIER = "commanded.turn", "controller.multiplier"
+"""Share of the commanded yaw rate that the robot reaches, and its controller's multiplier: without a body
+command unknown."""
+LOGARITHMS = (*ERRORS, COMMANDED_TURN, MULTIPLIER)
+"""Quantities beside the parameters; they are compared as logarithms."""
+_MULTIPLIER_ERROR = 0.02
+"""Standard deviation of the logarithm of a multiplier that is measured by the wheels: simulated runs of one
+controller differ by 0.01, and load and wear of real wheels, which all runs of a side share, do not average
+away."""
 _LEAST_SQUARE = 1e-12
 """Lower bound of a mean square error [m^2, rad^2], to keep its logarithm finite."""
-
-
 _LEAST_SLIP = 1e-6
 """Lower bound of a slip modulus [m/s], to keep its logarithm finite."""
-
-
-_LEAST_RISE = 0.01
-"""Smallest rise of chi-square between two values, to keep an error finite: less is the end of a fit."""
-
-
 _RESAMPLES = 200
 """Bootstrap resamples: they give the standard deviation to a twentieth."""
+Estimate = tuple[float, float]
+"""A value and its standard deviation."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """A parameter that a check compares.
-
-    Attributes:
-        effect: effect of the parameter, with the values of the model.
-        parameter: parameter of the effect.
-    """
+    """A parameter that a check compares, of an effect with the values of the model."""
 
     effect: Effect
     parameter: Parameter
@@ -133,104 +83,51 @@ class RunReading:
     """Estimates of a run with the model of a check.
 
     Attributes:
-        numbers: estimates of the labels and of `LOGARITHMS`, in that order.
-        sha256: hash of the recording.
+        run: name of the run.
         terrain: terrain of the run.
         pace: root mean square ideal speed [m/s]; a yaw rate of 1 rad/s counts as 1 m/s.
-        slip: logarithm of the median slip modulus [m/s], and its standard deviation; NaN if unknown.
-        fitted: the fit; None for a run from a baseline.
+        estimates: of the parameters by label, and of `LOGARITHMS`; of what the run determines.
+        slip: logarithm of the median slip modulus [m/s]; NaN if unknown.
     """
 
-    numbers: RunNumbers
-    sha256: str
+    run: str
     terrain: str
     pace: float
-    slip: tuple[float, float] = (math.nan, math.nan)
-    fitted: Fitted | None = field(default=None, repr=False)
+    estimates: dict[str, Estimate]
+    slip: Estimate = (math.nan, math.nan)
 
 
-def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label], side: Side) -> RunReading:
+def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label]) -> RunReading:
     """Fit a model to one run, starting from the model's values, and return the estimates.
-
-    The errors are those of the intervals of every fit (`estimate_intervals`). Correlations are shrunk
-    according to the ratio of blocks to estimated parameters.
 
     Args:
         run: run of the model's vehicle.
         model: model, the same for all runs of a check.
         source: input of the model.
         labels: parameters to return, from `list_labels`.
-        side: side of the check.
 
     Raises:
         MotionError: the run lacks the input, or is too short.
     """
-    data = EstimationData([run], model.vehicle, source)
-    fitted = fit_model(data, model)
-    names = [label.name for label in labels]
-    count = len(names) + len(LOGARITHMS)
-    values, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
-    for fit in fitted.fits:
-        if not fit.free:
-            continue
-        estimates = estimate_path(fit)
-        common = [
-            (index, item)
-            for index, item in enumerate(estimates.items)
-            if item.free.label in names
-            and item.observable
-            and math.isfinite(item.low)
-            and item.deviation > 0.0
-        ]
-        places = [index for index, _ in common]
-        rows = [names.index(item.free.label) for _, item in common]
-        deviations = np.array([item.deviation for _, item in common])
-        values[rows] = [item.value for _, item in common]
-        believed = 1.0 / (1.0 + len(estimates.items) / max(estimates.blocks, 1))
-        correlation = believed * np.nan_to_num(estimates.correlation[np.ix_(places, places)])
-        np.fill_diagonal(correlation, 1.0)
-        covariance[np.ix_(rows, rows)] = correlation * np.outer(deviations, deviations)
+    fitted = fit_model(EstimationData([run], model.vehicle, source), model)
+    names = {label.name for label in labels}
+    estimates = {
+        item.free.label: (item.value, item.deviation)
+        for fit in fitted.fits
+        if fit.free
+        for item in estimate_path(fit).items
+        if item.free.label in names and item.observable and math.isfinite(item.low) and item.deviation > 0.0
+    }
     errors, pace = _measure_errors(fitted)
+    estimates |= {name: error for name, error in zip(ERRORS, errors, strict=True) if math.isfinite(error[1])}
     turn = measure_commanded_turn(run, model.vehicle)
     if turn is not None:
-        errors += [(math.log(turn.share), turn.deviation), (math.log(turn.multiplier), MULTIPLIER_ERROR)]
-    for index, (value, deviation) in enumerate(errors, start=len(names)):
-        values[index], covariance[index, index] = value, deviation**2
-    covariance[np.isnan(covariance) & ~np.eye(count, dtype=bool)] = 0.0
-    numbers = RunNumbers(run.name, side, values, covariance)
-    return RunReading(numbers, run.sha256, run.terrain, pace, fitted=fitted)
+        estimates[COMMANDED_TURN] = (math.log(turn.share), turn.deviation)
+        estimates[MULTIPLIER] = (math.log(turn.multiplier), _MULTIPLIER_ERROR)
+    return RunReading(run.name, run.terrain, pace, estimates)
 
 
-def widen(reading: RunReading, labels: Sequence[Label], others: Mapping[str, float]) -> RunReading:
-    """The reading with the errors of some numbers by the likelihood at the values that another side has.
-
-    The error of a fit is that of small changes. Another value far from it may fit the run as well once the
-    other numbers follow: the error is then the one at which both values have their likelihoods.
-
-    Args:
-        reading: estimates of a run, returned unchanged without its fit.
-        labels: parameters of the reading, in its order.
-        others: value of another side, by name of the parameter.
-    """
-    fitted, numbers = reading.fitted, reading.numbers
-    factors = np.ones(numbers.values.size)
-    for index, label in enumerate(labels):
-        if fitted is None or label.name not in others or not numbers.known[index]:
-            continue
-        error, away = math.sqrt(numbers.covariance[index, index]), others[label.name] - numbers.values[index]
-        for fit in fitted.fits:
-            effect = fit.state.find(label.effect.id)
-            if effect is not None and label.name in {free.label for free in fit.free}:
-                name = label.parameter.name
-                moved = effect.change(**{name: others[label.name]}).fix(name)
-                risen = fit_path(fit.path, fit.state.add(moved), noise=fit.noise).score - fit.score
-                deviations = math.sqrt(max(risen / fit.overdispersion, _LEAST_RISE))
-                factors[index] = max(abs(away) / deviations / error, 1.0)
-    covariance = numbers.covariance * np.outer(factors, factors)
-    return replace(reading, numbers=replace(numbers, covariance=covariance))
-
-
-def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
+def _measure_errors(fitted: Fitted) -> tuple[list[Estimate], float]:
     """Logarithms of the errors divided by the speed, with their standard deviations, and the speed [m/s]."""
     data, state = fitted.data, fitted.state
     run_residuals = data.residuals_by_run[0]
@@ -239,9 +136,7 @@ def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
     stretch = _number(run_residuals.horizons.times[:, 0] - begin)
     asked = (data.whole.find_ideal()[:, 0] ** 2).sum(axis=1)
     driven = _number(data.whole.times[:, 0] - begin)
-    present, both = np.unique(np.concatenate((stretch, driven)), return_inverse=True)
-    stretch, driven = np.split(both, [stretch.size])
-    count = present.size
+    count = int(max(stretch.max(), driven.max())) + 1
     ideal = _sum(driven, asked, count)
     pace = math.sqrt(max(float(ideal[0].sum() / ideal[1].sum()), _LEAST_SQUARE))
     squares = (errors.position**2, errors.yaw**2)
@@ -257,7 +152,7 @@ def _sum(stretch: Ints, values: Floats, count: int) -> Floats:
     return np.array([np.bincount(stretch, values, count), np.bincount(stretch, minlength=count)])
 
 
-def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
+def _compare(errors: Floats, ideal: Floats) -> Estimate:
     """Half the logarithm of the ratio of two mean squares, and its standard deviation (delete-one jackknife).
 
     The deviation is that of the normal distribution with the 95 % interval of Student's t; NaN if there are
@@ -278,7 +173,7 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
     return float(look(whole)), deviation
 
 
-def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
+def measure_slip(table: pl.DataFrame, source: Input) -> Estimate:
     """Logarithm of a run's median slip modulus [m/s], and its standard deviation by a bootstrap of stretches.
 
     Args:

@@ -1,98 +1,33 @@
-"""Both sides of a check fitted with one model, and baseline files."""
+"""Both sides of a check, each run fitted with one model."""
 
 import contextlib
 import itertools
-import json
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
-import msgspec
 import numpy as np
 
-from pipeline.core import INPUTS, NORMAL_95, Floats, SlipError, finite_or_none, read_bounded
-from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
-from pipeline.datasets.check_readings import (
-    LOGARITHMS,
-    Label,
-    RunReading,
-    list_labels,
-    measure_slip,
-    read_run,
-)
+from pipeline.core import INPUTS, NORMAL_95, SlipError
+from pipeline.datasets.check_readings import Label, RunReading, list_labels, measure_slip, read_run
 from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.run_residuals import Input, choose_input
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
-from pipeline.models import (
-    Effect,
-    FormulaEffect,
-    Model,
-    ModelFile,
-    format_model,
-    is_of_one_run,
-    list_effects,
-    parse_model,
-)
+from pipeline.models import Effect, FormulaEffect, Model, ModelFile, is_of_one_run, list_effects
 from pipeline.recording.log_setup import UNKNOWN
 from pipeline.results import read_model
 from pipeline.run import MotionRun, load_motion_run
 from pipeline.sources import Owner, agree_on_vehicle, load_vehicle
-from pipeline.store import Manifest, Store, StoreError, decode_stored
+from pipeline.store import Manifest, Store
 
-BASELINE_FORMAT = 1
+BEFORE, AFTER = "before", "after"
 _MOST_OF_SPREAD = 16
 """Runs that determine a spread between runs: more take longer and change a limit by less than a twentieth."""
 _MOST = 0.5
 """Smallest fraction of a side's runs whose model has an effect: an effect of one run of many is its own."""
-_ROUNDING = 1e-6
-"""Tolerance of the symmetry and of negative eigenvalues of a correlation matrix."""
-_MOST_LOGARITHM = 30.0
-"""Largest absolute logarithm of an error or a slip in a valid baseline: exp(30) is 1e13 m."""
-Kind = Literal["runs", "model", "baseline"]
-
-
-class _StoredRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run of a baseline, see `RunReading`; unknown values are null."""
-
-    run: str
-    sha256: str
-    terrain: str
-    pace: float
-    values: list[float | None]
-    covariance: list[list[float | None]]
-    slip: tuple[float | None, float | None]
-
-
-class _StoredBaseline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a baseline file."""
-
-    format: int
-    input: Literal["command", "measured"]
-    model: str
-    numbers: list[str]
-    runs: list[_StoredRun]
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """Stored estimates of runs, as the reference of later checks.
-
-    Attributes:
-        model: model that the runs were fitted with.
-        source: input of the model.
-        names: names of the quantities.
-        readings: estimates of the runs.
-    """
-
-    model: ModelFile
-    source: Input
-    names: tuple[str, ...]
-    readings: tuple[RunReading, ...]
 
 
 @dataclass(frozen=True)
@@ -100,16 +35,15 @@ class Sides:
     """Both sides of a check, fitted with one model.
 
     Attributes:
-        kind: kind of the side BEFORE.
         model: model of both sides.
         source: input of the model.
         labels: compared parameters.
         before, after: estimates of the runs; a model file as BEFORE counts as one run with its values.
         notes: excluded runs with the reasons, and warnings.
         others: further runs of the vehicle on the same terrains, by terrain: they tell how much runs differ.
+        is_model: whether BEFORE is a model file.
     """
 
-    kind: Kind
     model: ModelFile
     source: Input
     labels: tuple[Label, ...]
@@ -117,23 +51,24 @@ class Sides:
     after: tuple[RunReading, ...]
     notes: tuple[str, ...] = ()
     others: Mapping[str, tuple[RunReading, ...]] = field(default_factory=dict)
+    is_model: bool = False
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the quantities of each run, the logarithms last."""
-        return (*(label.name for label in self.labels), *LOGARITHMS)
-
-    @property
-    def terrains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def terrains(self) -> tuple[list[str], list[str]]:
         """Terrains of both sides."""
-        before, after = (
-            tuple(sorted({one.terrain for one in side if one.terrain})) for side in (self.before, self.after)
-        )
+        before, after = (sorted({one.terrain for one in side} - {""}) for side in (self.before, self.after))
         return before, after
+
+    @property
+    def grouped(self) -> list[tuple[str, RunReading]]:
+        """All runs with their group: the side, or the terrain of further runs."""
+        sides = [(BEFORE, self.before), (AFTER, self.after)]
+        sides += [(f"others on {name}", runs) for name, runs in self.others.items()]
+        return [(name, reading) for name, runs in sides for reading in runs]
 
 
 def read_sides(
-    before: Sequence[Manifest] | ModelFile | Baseline,
+    before: Sequence[Manifest] | ModelFile,
     after: Sequence[Manifest],
     store: Store,
     *,
@@ -142,11 +77,11 @@ def read_sides(
 ) -> Sides:
     """Fit one model to both sides of a check.
 
-    A model file or a baseline defines the model. For runs, the model has the effects that the diagnoses of at
+    A model file defines the model. For runs, the model has the effects that the diagnoses of at
     least half of the runs of either side identify; runs without a diagnosis are diagnosed first.
 
     Args:
-        before: runs, a model file, or a baseline.
+        before: runs, or a model file.
         after: runs.
         store: results that contain the runs.
         source: `command` or `measured`; None chooses.
@@ -159,13 +94,14 @@ def read_sides(
         if isinstance(runs_of, Sequence) and not runs_of:
             what = f"the check has no runs {side.upper()}"
             raise ComparisonError("no_runs", what, hint="Give logs, or runs of the results.")
-    given = None if isinstance(before, Sequence) else before
-    file = before.model if isinstance(before, Baseline) else given if isinstance(given, ModelFile) else None
-    manifests, notes_before = _leave_out_refused(before if isinstance(before, Sequence) else (), BEFORE)
+    file = before if isinstance(before, ModelFile) else None
+    manifests, notes_before = _leave_out_refused(() if isinstance(before, ModelFile) else before, BEFORE)
     after, notes_after = _leave_out_refused(after, AFTER)
     everything = [*manifests, *after]
-    known = before.readings if isinstance(before, Baseline) else ()
-    _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
+    held = {_digest(one) for one in manifests} - {""}
+    if shared := sorted({one.run for one in after if _digest(one) in held}):
+        what = f"a run is on both sides: {', '.join(shared)}"
+        raise ComparisonError("same_run", what, hint="Give runs before the change, and others after it.")
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
     models = {one.run: _find_model(one, store, is_needed=file is None) for one in everything}
     starts = {run: model for run, model in models.items() if model is not None}
@@ -173,21 +109,20 @@ def read_sides(
         united = unite_effects(*([models[one.run] for one in side] for side in (manifests, after)))
         file = ModelFile(Model(vehicle, united))
     file = replace(file, model=replace(file.model, vehicle=vehicle))
-    if isinstance(before, Baseline):
-        file = replace(file, fit={**file.fit, "input": before.source.value})
-    sides: dict[Side, Sequence[MotionRun]] = {BEFORE: runs[: len(manifests)], AFTER: runs[len(manifests) :]}
-    both = read_under(file, sides, source, known=known, starts=starts)
+    sides = (runs[: len(manifests)], runs[len(manifests) :])
+    both = read_under(file, sides, source, starts=starts)
     slips = {one.run: measure_slip(one.read("slip"), both.source) for one in everything}
-    held = {*(_digest(one) for one in everything), *(one.sha256 for one in known)}
-    others = _read_others(_list_others(store, both, held), both, store)
-    names: dict[type, Kind] = {Baseline: "baseline", ModelFile: "model"}
+    known = [
+        tuple(replace(one, slip=slips.get(one.run, one.slip)) for one in side)
+        for side in (both.before, both.after)
+    ]
+    others = _list_others(store, both, {_digest(one) for one in everything})
     return replace(
         both,
-        kind=names.get(type(before), "runs"),
-        before=tuple(_note_slip(one, slips) for one in both.before),
-        after=tuple(_note_slip(one, slips) for one in both.after),
+        before=known[0],
+        after=known[1],
         notes=(*notes_before, *notes_after, *both.notes),
-        others=others,
+        others=_read_others(others, both, store),
     )
 
 
@@ -195,16 +130,14 @@ def _list_others(store: Store, sides: Sides, held: Collection[str]) -> list[Mani
     """Further runs of the vehicle on the terrains of a check; none where enough runs are on its sides."""
     room = _MOST_OF_SPREAD - len(sides.before) - len(sides.after)
     terrains = {*itertools.chain(*sides.terrains)} - {UNKNOWN}
-    if room <= 0 or not terrains:
-        return []
     others: dict[str, Manifest] = {}
-    for manifest in store.survey().manifests:
+    for manifest in store.survey().manifests if room > 0 else ():
         is_here = manifest.details.get("terrain") in terrains
         if is_here and manifest.part("vehicle").get("id") == sides.model.model.vehicle.id:
             digest = _digest(manifest)
             if digest and digest not in held and not find_run_refusal(manifest):
                 others.setdefault(digest, manifest)
-    return [*others.values()][-room:]
+    return [*others.values()][-max(room, 1) :]
 
 
 def _read_others(
@@ -218,13 +151,12 @@ def _read_others(
         start = sides.model.model.swap(*(effect for effect in own if effect.id in sides.model.model))
         with contextlib.suppress(SlipError):
             agree_on_vehicle(vehicle, {manifest.run: load_vehicle(manifest)}, None)
-            run = load_motion_run(manifest, vehicle)
-            reading = read_run(run, start, sides.source, sides.labels, BEFORE)
+            reading = read_run(load_motion_run(manifest, vehicle), start, sides.source, sides.labels)
             readings.setdefault(reading.terrain, []).append(reading)
     return {terrain: tuple(runs) for terrain, runs in readings.items() if len(runs) > 1}
 
 
-def _leave_out_refused(manifests: Sequence[Manifest], side: Side) -> tuple[list[Manifest], list[str]]:
+def _leave_out_refused(manifests: Sequence[Manifest], side: str) -> tuple[list[Manifest], list[str]]:
     """Runs of a side to which a fit has a meaning, and notes on the others; an error where none has."""
     refused = {one.run: why for one in manifests if (why := find_run_refusal(one))}
     sound = [one for one in manifests if one.run not in refused]
@@ -235,25 +167,19 @@ def _leave_out_refused(manifests: Sequence[Manifest], side: Side) -> tuple[list[
     return sound, [f"left out: {reason}" for reason in reasons]
 
 
-def _note_slip(reading: RunReading, slips: Mapping[str, tuple[float, float]]) -> RunReading:
-    return replace(reading, slip=slips.get(reading.numbers.run, reading.slip))
-
-
 def read_under(
     file: ModelFile,
-    runs: Mapping[Side, Sequence[MotionRun]],
+    runs: tuple[Sequence[MotionRun], Sequence[MotionRun]],
     source: str | None = None,
     *,
-    known: Sequence[RunReading] = (),
     starts: Mapping[str, Model] = MappingProxyType({}),
 ) -> Sides:
     """Fit a model to the runs of both sides.
 
     Args:
         file: the model, with the vehicle whose geometry is used.
-        runs: runs of both sides; if BEFORE has none, the values of the model take its place.
+        runs: runs before and after; if there are none before, the values of the model take their place.
         source: `command` or `measured`; None chooses.
-        known: estimates of BEFORE from a baseline.
         starts: models of single runs, by name, from whose values the fit to that run starts: on ice a fit
             that starts from the friction of asphalt does not find its own.
 
@@ -261,39 +187,31 @@ def read_under(
         ComparisonError: ``nothing_to_compare``: no run of a side can be fitted.
         MotionError: the runs lack the input.
     """
-    chosen = choose_input([*runs[BEFORE], *runs[AFTER]], source, file.model, last=file.last_input)
+    chosen = choose_input([*runs[0], *runs[1]], source, file.model, last=file.last_input)
     labels = tuple(list_labels(file.model, file.per_run))
     notes = [chosen.warning] if chosen.warning else []
-    readings: dict[Side, list[RunReading]] = {BEFORE: list(known), AFTER: []}
-    for side in (BEFORE, AFTER):
-        for run in runs[side]:
+    sides: list[list[RunReading]] = [[], []]
+    for readings, side in zip(sides, runs, strict=True):
+        for run in side:
             own = starts.get(run.name, ())
             start = file.model.swap(*(effect for effect in own if effect.id in file.model))
             try:
-                readings[side].append(read_run(run, start, chosen.source, labels, side))
+                readings.append(read_run(run, start, chosen.source, labels))
             except SlipError as error:
                 notes.append(f"left out: {error}")
-    if not runs[BEFORE] and not known:
-        readings[BEFORE].append(_read_model(file, labels))
-    for side in (BEFORE, AFTER):
-        if not readings[side]:
-            what = f"no run {side.upper()} can be compared: {'; '.join(notes)}"
+    is_model = not runs[0]
+    if is_model:
+        sides[0].append(_read_model(file, labels))
+    for name, readings in zip((BEFORE, AFTER), sides, strict=True):
+        if not readings:
+            what = f"no run {name.upper()} can be compared: {'; '.join(notes)}"
             raise ComparisonError("nothing_to_compare", what, hint="Give other runs, or drive longer.")
-    before, after = (tuple(readings[side]) for side in (BEFORE, AFTER))
-    return Sides("runs", file, chosen.source, labels, before, after, tuple(notes))
+    before, after = map(tuple, sides)
+    return Sides(file, chosen.source, labels, before, after, tuple(notes), is_model=is_model)
 
 
 def _digest(manifest: Manifest) -> str:
     return str(manifest.part("log").get("sha256", ""))
-
-
-def _refuse_shared(before: Sequence[str], after: Sequence[Manifest]) -> None:
-    """Raise an error if a recording, identified by its SHA-256, is on both sides."""
-    held = {one for one in before if one}
-    shared = sorted({one.run for one in after if _digest(one) in held})
-    if shared:
-        what = f"a run is on both sides: {', '.join(shared)}"
-        raise ComparisonError("same_run", what, hint="Give runs before the change, and others after it.")
 
 
 def _find_model(manifest: Manifest, store: Store, *, is_needed: bool) -> Model | None:
@@ -357,99 +275,11 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
 
     Without any interval they count as exact. Else those that are not fixed and have none are undetermined.
     """
-    count = len(labels) + len(LOGARITHMS)
-    values, deviations = np.full(count, np.nan), np.full(count, np.nan)
-    for index, label in enumerate(labels):
-        is_stated = not file.intervals or label.name in file.intervals
-        if not (is_stated or label.parameter.name in label.effect.fixed):
-            continue
-        low, high = file.intervals.get(label.name, (0.0, 0.0))
-        values[index] = label.effect.values[label.parameter.name]
-        deviations[index] = max(0.5 * (high - low) / NORMAL_95, 0.0)
+    estimates = {}
+    for label in labels:
+        name = label.parameter.name
+        if not file.intervals or label.name in file.intervals or name in label.effect.fixed:
+            low, high = file.intervals.get(label.name, (0.0, 0.0))
+            estimates[label.name] = (label.effect.values[name], max(0.5 * (high - low) / NORMAL_95, 0.0))
     terrains = {str(run.get("terrain")) for run in file.list_fitted("runs")}
-    covariance = np.diag(deviations**2)
-    numbers = RunNumbers("model", BEFORE, values, covariance)
-    return RunReading(numbers, "", terrains.pop() if len(terrains) == 1 else "", math.nan)
-
-
-def format_baseline(sides: Sides) -> str:
-    """Text of a baseline file: the side AFTER, as the reference of later checks."""
-    stored = _StoredBaseline(
-        format=BASELINE_FORMAT,
-        input=sides.source.value,
-        model=format_model(sides.model),
-        numbers=list(sides.names),
-        runs=[
-            _StoredRun(
-                one.numbers.run,
-                one.sha256,
-                one.terrain,
-                one.pace,
-                _list(one.numbers.values),
-                [_list(row) for row in one.numbers.covariance],
-                (finite_or_none(one.slip[0]), finite_or_none(one.slip[1])),
-            )
-            for one in sides.after
-        ],
-    )
-    return json.dumps(msgspec.to_builtins(stored), indent=1, allow_nan=False) + "\n"
-
-
-def _list(values: Floats) -> list[float | None]:
-    return [finite_or_none(value) for value in values.tolist()]
-
-
-def read_baseline(path: Path) -> Baseline:
-    """Read a baseline file that a check has written.
-
-    Raises:
-        ComparisonError: ``bad_baseline``: it does not exist, or is not a valid baseline.
-        MotionError: its model cannot be read.
-    """
-    hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
-    try:
-        stored = decode_stored(read_bounded(path), _StoredBaseline, path)
-    except OSError as error:
-        what = f"the baseline cannot be read ({error.strerror})"
-        raise ComparisonError("bad_baseline", what, where=str(path), hint=hint) from error
-    except StoreError as error:
-        what = f"this is not a baseline: {error.what}"
-        raise ComparisonError("bad_baseline", what, where=str(path), hint=hint) from error
-    file = parse_model(stored.model, path)
-    names = (*(label.name for label in list_labels(file.model, file.per_run)), *LOGARITHMS)
-    count = len(names)
-    fits = all(
-        len(run.values) == count and [len(row) for row in run.covariance] == [count] * count
-        for run in stored.runs
-    )
-    is_ours = stored.format == BASELINE_FORMAT and tuple(stored.numbers) == names
-    readings = tuple(map(_open_run, stored.runs)) if fits and is_ours else ()
-    if not (readings and all(map(_is_sound, readings))):
-        what = "the baseline is of another version, or its numbers are not those of fits of its model"
-        raise ComparisonError("bad_baseline", what, where=str(path), hint=hint)
-    return Baseline(file, Input(stored.input), names, readings)
-
-
-def _open_run(run: _StoredRun) -> RunReading:
-    slip = _array(run.slip)
-    numbers = RunNumbers(run.run, BEFORE, _array(run.values), _array(run.covariance))
-    return RunReading(numbers, run.sha256, run.terrain, run.pace, (float(slip[0]), float(slip[1])))
-
-
-def _is_sound(reading: RunReading) -> bool:
-    """Whether a fit can give these estimates: the covariance is valid, and the robot moved."""
-    rows = np.flatnonzero(reading.numbers.known)
-    covariance = reading.numbers.covariance[np.ix_(rows, rows)]
-    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    logarithms = np.append(reading.numbers.values[-len(LOGARITHMS) :], reading.slip[0])
-    if not (size > 0.0).all() or not reading.pace > 0.0 or (np.abs(logarithms) > _MOST_LOGARITHM).any():
-        return False
-    correlation = covariance / np.outer(size, size)
-    if not np.allclose(correlation, correlation.T, atol=_ROUNDING):
-        return False
-    return bool(np.linalg.eigvalsh(correlation).min(initial=1.0) > -_ROUNDING)
-
-
-def _array(values: Sequence[object]) -> Floats:
-    """Array of values, NaN for None."""
-    return np.array(values, dtype=np.float64)
+    return RunReading("model", terrains.pop() if len(terrains) == 1 else "", math.nan, estimates)

@@ -2,127 +2,102 @@
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, format_count, group_by
-from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
+from pipeline.core import FEWEST_OF_SPREAD, format_count, group_by, read_version
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
     Question,
-    can_read,
     choose_input,
     choose_runs,
     find_material,
     find_untested,
     measure_runs,
     note_untested,
+    read_digest,
 )
-from pipeline.datasets.equal_driving import Levelled, Overlap, find_overlap, level_runs, measure_bins
+from pipeline.datasets.equal_driving import Levelled, find_overlap, level_runs, measure_bins
 from pipeline.datasets.pairs import (
-    ABOUT_UNIT,
-    AS_DRIVEN,
-    AS_PUBLISHED,
     BLOCKS,
-    EQUAL_DRIVING,
-    Answer,
+    OVER_RUNS,
+    THIS_RUN,
     Group,
-    Pair,
     Samples,
-    View,
+    bound_groups,
     bound_run,
     compare_groups,
+    connect_groups,
+    level_groups,
     tabulate_pairs,
 )
-from pipeline.datasets.pooled_tests import bound_levels, level_groups
-from pipeline.datasets.pooling import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
+from pipeline.datasets.pooling import pool_runs
 from pipeline.datasets.published_chain import follow_published, read_limits
-from pipeline.datasets.rank_tests import Interval, connect_groups
 from pipeline.store import ANALYZE_FIRST, Store, lack_runs
+from schemas import contract_of
 
+AS_DRIVEN, EQUAL_DRIVING, AS_PUBLISHED = "median_modulus", "equal_modulus", "published_norm"
+"""Quantities that are compared."""
+QUANTITIES = {AS_DRIVEN: "as driven", EQUAL_DRIVING: "at equal driving", AS_PUBLISHED: "as published"}
+ABOUT_UNIT = (
+    "the norm of a 2 s window is sqrt(40) = 6.32 times the root mean square of its slip modulus (L = 1 m), "
+    "in m/s; the paper prints the same number in m^2 rad/s^3, the product of the units of its three "
+    "components, which is the unit of no norm"
+)
 _FEWEST = 2
-
+_HASH = 64
+"""Characters of a SHA-256 in hexadecimal."""
 _NORMS = ("windows", "t_start", "window_norm")
 """Table and columns of the 2 s window norms."""
-
-Bounds = dict[tuple[str, str], Interval]
+Bounds = dict[tuple[str, str], tuple[float, float]]
 """Intervals by run and input."""
-Overlaps = Mapping[frozenset[str], Overlap]
-"""Driving in common by the datasets of a pair."""
 
 
-def read_samples(
-    compared: ComparedRuns, input_name: str, table: str = "slip", time: str = "t", value: str = "modulus"
-) -> dict[str, Samples]:
-    """Samples of every run on one input, without suspect, null and non-finite ones: slip moduli by default.
+@dataclass(frozen=True)
+class Answer:
+    """Result of a comparison.
 
-    Args:
-        compared: the runs.
-        input_name: `command` or `measured`.
-        table: table to read.
-        time: its column of times [s].
-        value: its column of values.
+    Attributes:
+        input, quantity: of the main comparison.
+        views: inputs and quantities that were compared, the main ones first.
+        datasets: table `datasets`, both inputs.
+        levels: ``input``, ``quantity``, ``dataset``, ``value``, ``low``, ``high``, ``interval`` of every
+            view.
+        comparisons: table `comparisons` of every view.
+        families: vehicles, and their datasets that are compared with each other.
+        runs: one row per run and input with all its measures.
+        features: table `features`: what can be given away of the runs.
+        notes: excluded runs, pairs that cannot be told apart.
     """
-    frame = (
-        compared.scan(table)
-        .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
-        .select("run", time, value)
-        .collect()
-    )
-    parts = frame.partition_by("run", as_dict=True, maintain_order=True)
-    return {
-        str(run): _take_samples(part[time], part[value])
-        for (run,), part in parts.items()
-        if part.height >= _FEWEST
-    }
 
+    views: tuple[tuple[str, str], ...]
+    datasets: pl.DataFrame
+    levels: pl.DataFrame
+    comparisons: pl.DataFrame
+    families: Mapping[str, tuple[str, ...]]
+    runs: pl.DataFrame
+    features: pl.DataFrame
+    notes: tuple[str, ...]
 
-def _take_samples(times: pl.Series, values: pl.Series) -> Samples:
-    order = times.arg_sort()
-    step = float(np.median(np.diff(times[order].to_numpy())))
-    return Samples(values[order].to_numpy(), len(times) * step)
+    @property
+    def input(self) -> str:
+        """Input u of the main comparison."""
+        return self.views[0][0]
 
+    @property
+    def measure(self) -> str:
+        """Name of the main quantity, its length scale included."""
+        if self.views[0][1] == AS_PUBLISHED:
+            return "2 s window norm as published (L = 1 m)"
+        (scale,) = self.datasets["length_scale"].drop_nulls().unique().to_list() or (1.0,)
+        return f"median slip modulus (L = {scale:g} m)"
 
-def follow_published_runs(
-    compared: ComparedRuns, runs: pl.DataFrame
-) -> tuple[dict[str, Samples], pl.DataFrame, list[str]]:
-    """Window norms of the published processing chain for every run that it applies to.
-
-    Returns:
-        Samples by run; the runs with ``published_norm`` in their rows of the command; notes on the fits.
-    """
-    samples: dict[str, Samples] = {}
-    notes: list[str] = []
-    for run, manifest in compared.manifests.items():
-        findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
-        followed = follow_published(
-            manifest.read("slip"),
-            manifest.read("poses"),
-            limits=read_limits(manifest.part("vehicle")),
-            command_is_scaled="command_scale" in findings,
-        )
-        if followed is None:
-            continue
-        samples[run] = _take_samples(followed.norms["t_start"], followed.norms["window_norm"])
-        scaled = f", command scaled by {followed.scale[0]:.2f} forward and {followed.scale[1]:.2f} in yaw" * (
-            followed.scale != (1.0, 1.0)
-        )
-        notes.append(f"published chain, {run}: wheels lag with tau = {followed.tau_s:.2f} s{scaled}")
-    medians = pl.DataFrame(
-        {"run": list(samples), "published_norm": [own.median for own in samples.values()]},
-        schema={"run": pl.String, "published_norm": pl.Float64},
-    ).with_columns(pl.lit("command").cast(runs.schema["input"]).alias("input"))
-    return samples, runs.update(medians, on=["run", "input"]), notes
-
-
-_WINDOW_COLUMNS = {
-    "run": pl.String,
-    "input": pl.String,
-    "suspect": pl.Boolean,
-    "window_norm": pl.Float64,
-}
+    def take(self, table: pl.DataFrame, view: tuple[str, str]) -> pl.DataFrame:
+        """Rows of `levels` or `comparisons` of one view."""
+        source, quantity = view
+        return table.filter(pl.col("input").cast(pl.String) == source, pl.col("quantity") == quantity)
 
 
 def compare_results(store: Store, question: Question) -> Answer:
@@ -139,22 +114,13 @@ def compare_results(store: Store, question: Question) -> Answer:
         what = "there is no run whose numbers can be compared"
         raise lack_runs("nothing_to_compare", what, store.root, ANALYZE_FIRST, compared.notes)
     untested = find_untested(compared, question)
-    material = _Material(compared, question, untested, _find_families(compared, untested), runs, notes)
-    return material.compare_published() if question.as_published else material.compare_driving()
+    families = _find_families(compared, untested)
+    return _Comparison(compared, question, untested, families, runs, notes).answer()
 
 
 @dataclass
-class _Material:
-    """What a comparison is made of.
-
-    Attributes:
-        compared: the runs.
-        question: what is asked.
-        untested: pairs of datasets without a test.
-        families: datasets that are compared with each other, by their vehicles.
-        runs: one row per run and input with all its measures.
-        notes: grows with what is found.
-    """
+class _Comparison:
+    """A comparison in the making: the runs with their measures, and notes that grow with what is found."""
 
     compared: ComparedRuns
     question: Question
@@ -163,73 +129,112 @@ class _Material:
     runs: pl.DataFrame
     notes: list[str]
 
-    def compare_driving(self) -> Answer:
-        """Compare slip moduli on the inputs, each as driven and at equal driving."""
-        main = self.question.input or choose_input(self.runs)
-        others = {"command", "measured"} & set(self.runs["input"].cast(pl.String)) - {main}
-        inputs = [main, *(sorted(others) if self.question.input is None else ())]
-        self.notes += _doubt_commands(self.compared) if "command" in inputs else []
+    def answer(self) -> Answer:
+        """Compare slip on the inputs, each as driven and at equal driving, or the norms as published."""
         tables: dict[tuple[str, str], pl.DataFrame] = {}
+        levels: list[pl.DataFrame] = []
+        if self.question.as_published:
+            main, inputs = "command", ["command"]
+            samples = self._follow_published()
+            groups = self._group(samples, main, AS_PUBLISHED)
+            tables[main, AS_PUBLISHED] = self._compare(groups, main, AS_PUBLISHED)
+            levels.append(_bound_published(groups, self.families))
+        else:
+            main = self.question.input or choose_input(self.runs)
+            others = {"command", "measured"} & set(self.runs["input"].cast(pl.String)) - {main}
+            inputs = [main, *(sorted(others) if self.question.input is None else ())]
+            self.notes += _doubt_commands(self.compared) if "command" in inputs else []
         within: Bounds = {}
         norms_within: Bounds = {}
         for name in inputs:
-            moduli = read_samples(self.compared, name)
-            tables[name, AS_DRIVEN] = self._compare(self._group(moduli, name, AS_DRIVEN), name, AS_DRIVEN)
+            moduli = _read_samples(self.compared, name)
             within |= self._bound_single(moduli, name)
-            norms_within |= self._bound_single(read_samples(self.compared, name, *_NORMS), name)
-        labels = self.compared.labels.select("run", "group")
-        bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
-        driven = self._level_driving(bins, inputs)
-        at_equal = []
-        for name in inputs:
-            levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
-            groups = _group_levels(levels)
-            overlaps = {
-                frozenset((a.name, b.name)): find_overlap(driven[name][a.name].bins, a.names, b.names)
-                for a, b in itertools.combinations(groups, 2)
-            }
-            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps, driven[name])
-            at_equal.append(self._level_datasets(groups, name, driven[name]))
+            norms_within |= self._bound_single(_read_samples(self.compared, name, *_NORMS), name)
+            if not self.question.as_published:
+                groups = self._group(moduli, name, AS_DRIVEN)
+                tables[name, AS_DRIVEN] = self._compare(groups, name, AS_DRIVEN)
         datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
-        datasets = datasets.update(pl.concat(at_equal), on=["dataset", "input"])
-        views = [View(*key, _list_levels(datasets, *key), table) for key, table in tables.items()]
-        return self._answer(datasets, views, self.compared.scan("windows"), bins)
-
-    def compare_published(self) -> Answer:
-        """Compare the window norms of the published chain."""
-        name = "command"
-        samples, self.runs, comments = follow_published_runs(self.compared, self.runs)
-        self.notes += [ABOUT_UNIT, *comments]
-        groups = self._group(samples, name, AS_PUBLISHED)
-        table = self._compare(groups, name, AS_PUBLISHED)
-        datasets = pool_runs(
-            self.runs,
-            self.question.by,
-            within=self._bound_single(read_samples(self.compared, name), name),
-            norms_within=self._bound_single(read_samples(self.compared, name, *_NORMS), name),
+        if not self.question.as_published:
+            at_equal = self._level_driving(inputs, tables)
+            datasets = datasets.update(at_equal, on=["dataset", "input"])
+            levels += [_list_levels(datasets, *view) for view in tables]
+        return Answer(
+            views=tuple(tables),
+            datasets=datasets,
+            levels=pl.concat(levels),
+            comparisons=pl.concat(tables.values()),
+            families=self.families,
+            runs=self.runs,
+            features=_list_features(self.compared, self.runs),
+            notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
         )
-        view = View(name, AS_PUBLISHED, _bound_published(groups, self.families), table)
-        return self._answer(datasets, [view], _tabulate_windows(samples, name), pl.DataFrame())
+
+    def _follow_published(self) -> dict[str, Samples]:
+        """Window norms of the published processing chain for every run that it applies to."""
+        samples: dict[str, Samples] = {}
+        self.notes.append(ABOUT_UNIT)
+        for run, manifest in self.compared.manifests.items():
+            findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
+            followed = follow_published(
+                manifest.read("slip"),
+                manifest.read("poses"),
+                limits=read_limits(manifest.part("vehicle")),
+                command_is_scaled="command_scale" in findings,
+            )
+            if followed is None:
+                continue
+            samples[run] = _take_samples(followed.norms["t_start"], followed.norms["window_norm"])
+            forward, turning = followed.scale
+            scaled = f", command scaled by {forward:.2f} forward and {turning:.2f} in yaw"
+            text = f"published chain, {run}: wheels lag with tau = {followed.tau_s:.2f} s"
+            self.notes.append(text + scaled * (followed.scale != (1.0, 1.0)))
+        medians = pl.DataFrame(
+            {"run": list(samples), AS_PUBLISHED: [float(np.median(own.values)) for own in samples.values()]},
+            schema={"run": pl.String, AS_PUBLISHED: pl.Float64},
+        ).with_columns(pl.lit("command").cast(self.runs.schema["input"]).alias("input"))
+        self.runs = self.runs.update(medians, on=["run", "input"])
+        return samples
 
     def _group(self, samples: Mapping[str, Samples], name: str, quantity: str) -> list[Group]:
         if missing := sorted(set(self.compared.manifests) - set(samples)):
             what = f"no {quantity.replace('_', ' ')} on {name}"
             self.notes.append(f"{', '.join(missing)} not compared: {what}")
-        return _group(self.compared, samples)
+        known = self.compared.labels.filter(pl.col("run").is_in(list(samples))).sort("group", "run")
+        return [
+            Group.of_runs(str(group), [samples[run] for run in rows["run"]])
+            for (group,), rows in known.partition_by("group", as_dict=True, maintain_order=True).items()
+        ]
 
     def _compare(
         self,
         groups: Sequence[Group],
         name: str,
         quantity: str,
-        overlaps: Overlaps | None = None,
         levelled: Mapping[str, Levelled] | None = None,
     ) -> pl.DataFrame:
-        """Table `comparisons` of the groups by a quantity on an input."""
-        pairs = compare_groups(groups, untested=self.untested, overlaps=overlaps, levelled=levelled)
-        self.notes += _sum_up(pairs, groups, _WORDS[quantity])
-        keys = _keys(self.compared)
-        return tabulate_pairs(pairs, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
+        """Table `comparisons` of the groups by a quantity on an input, and notes on what it cannot tell."""
+        overlaps = None
+        if levelled is not None:
+            overlaps = {
+                frozenset((a.name, b.name)): find_overlap(levelled[a.name].bins, a.names, b.names)
+                for a, b in itertools.combinations(groups, 2)
+            }
+        rows = compare_groups(groups, untested=self.untested, overlaps=overlaps, levelled=levelled)
+        if len(groups) == 1:
+            self.notes.append("there is one dataset only: nothing to compare it with")
+        silent = group_by(
+            (str(row["note"]), f"{row['a']} and {row['b']}") for row in rows if row["p"] is None
+        )
+        for note, (first, *others) in sorted(silent.items()):
+            others_text = f", and {format_count(len(others), 'more pair')}" if others else ""
+            self.notes.append(f"{first}{others_text}, {QUANTITIES[quantity]}: {note}")
+        single = sorted({str(row[k]) for row in rows if row["unit_of_analysis"] == BLOCKS for k in "ab"})
+        if single:
+            names = ", ".join(single)
+            self.notes.append(f"one run only: {names}; their intervals describe the run, not the terrain")
+        named = self.compared.labels.with_columns(pl.concat_str("run", "key", separator="/").alias("keyed"))
+        keys = dict(named.group_by("group").agg(pl.col("keyed").sort().str.join(" ")).iter_rows())
+        return tabulate_pairs(rows, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
 
     def _bound_single(self, samples: Mapping[str, Samples], name: str) -> Bounds:
         """Intervals of runs that are alone in their dataset."""
@@ -237,67 +242,74 @@ class _Material:
         ends = {run: bound_run(samples[run]) for run in alone if run in samples}
         return {(run, name): one for run, one in ends.items() if one is not None}
 
-    def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, dict[str, Levelled]]:
-        """Give runs their levels at equal driving; what they are of, by input and dataset."""
-        driven: dict[str, dict[str, Levelled]] = {}
+    def _level_driving(
+        self, inputs: Sequence[str], tables: dict[tuple[str, str], pl.DataFrame]
+    ) -> pl.DataFrame:
+        """Compare levels at equal driving; those of the datasets, with their intervals."""
+        labels = self.compared.labels.select("run", "group")
+        bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
+        source = self.runs.schema["input"]
+        rows: list[tuple[str, str, float, float | None, float | None]] = []
         for name in inputs:
-            driven[name] = {}
+            driven: dict[str, Levelled] = {}
+            groups: list[Group] = []
             for datasets in self.families.values():
                 own = bins.filter(pl.col("input") == name, pl.col("group").is_in(list(datasets)))
                 levelled = level_runs(own)
-                driven[name] |= dict.fromkeys(datasets, levelled)
                 if levelled.apart:
-                    runs = ", ".join(levelled.apart)
                     why = f"a cell of driving counts from {FEWEST_OF_SPREAD} runs on"
-                    self.notes.append(f"no level at equal driving, too little in common ({why}): {runs}")
+                    alone = ", ".join(levelled.apart)
+                    self.notes.append(f"no level at equal driving, too little in common ({why}): {alone}")
+                driven |= dict.fromkeys(datasets, levelled)
+                known = levelled.runs.join(labels, on="run").sort("group", "run")
+                family = [
+                    Group(str(group), part["level"].to_numpy(), names=tuple(part["run"]))
+                    for (group,), part in known.partition_by(
+                        "group", as_dict=True, maintain_order=True
+                    ).items()
+                ]
+                for group, (level, ends) in zip(
+                    family, level_groups(family, levelled) if family else (), strict=True
+                ):
+                    rows.append((group.name, name, level, *(ends or (None, None))))
+                groups += family
                 levels = levelled.runs.select(
-                    "run",
-                    pl.lit(name).cast(self.runs.schema["input"]).alias("input"),
-                    pl.col("level").alias(EQUAL_DRIVING),
+                    "run", pl.lit(name).cast(source).alias("input"), pl.col("level").alias(EQUAL_DRIVING)
                 )
                 self.runs = self.runs.update(levels, on=["run", "input"])
+            groups.sort(key=lambda group: group.name)
+            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, driven)
         if short := sorted(set(self.compared.manifests) - set(bins["run"])):
             runs = ", ".join(short)
             self.notes.append(f"no level at equal driving, too little driving on commands: {runs}")
-        return driven
-
-    def _level_datasets(
-        self, groups: Sequence[Group], name: str, driven: Mapping[str, Levelled]
-    ) -> pl.DataFrame:
-        """Levels of the datasets at equal driving, with their intervals."""
-        rows: list[tuple[str, float, float | None, float | None]] = []
-        for datasets in self.families.values():
-            if own := [group for group in groups if group.name in datasets]:
-                errors = driven[own[0].name].find_errors([run for group in own for run in group.names])
-                levels = level_groups([group.values for group in own], errors)
-                for group, (level, ends) in zip(own, levels, strict=True):
-                    rows.append((group.name, level, *((ends.low, ends.high) if ends else (None, None))))
+        kinds = {"dataset": pl.String, "input": pl.String}
         numbers = dict.fromkeys((EQUAL_DRIVING, "equal_low", "equal_high"), pl.Float64)
-        return pl.DataFrame(rows, schema={"dataset": pl.String, **numbers}, orient="row").with_columns(
-            pl.lit(name).cast(self.runs.schema["input"]).alias("input")
-        )
-
-    def _answer(
-        self, datasets: pl.DataFrame, views: Sequence[View], windows: pl.LazyFrame, bins: pl.DataFrame
-    ) -> Answer:
-        labels = self.compared.labels.select("run", "group")
-        return Answer(
-            datasets=datasets,
-            views=tuple(views),
-            families=self.families,
-            runs=self.runs,
-            bins=bins,
-            carriers=_find_carriers(self.compared, [view.input for view in views]),
-            windows=spread_windows(windows, labels),
-            notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
+        return pl.DataFrame(rows, schema={**kinds, **numbers}, orient="row").with_columns(
+            pl.col("input").cast(source)
         )
 
 
-_WORDS = {
-    AS_DRIVEN: "as driven",
-    EQUAL_DRIVING: "at equal driving",
-    AS_PUBLISHED: "as published",
-}
+def _read_samples(
+    compared: ComparedRuns, input_name: str, table: str = "slip", time: str = "t", value: str = "modulus"
+) -> dict[str, Samples]:
+    """Sound samples of every run on one input: slip moduli by default."""
+    frame = (
+        compared.scan(table)
+        .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
+        .select("run", time, value)
+        .collect()
+    )
+    return {
+        str(run): _take_samples(part[time], part[value])
+        for (run,), part in frame.partition_by("run", as_dict=True, maintain_order=True).items()
+        if part.height >= _FEWEST
+    }
+
+
+def _take_samples(times: pl.Series, values: pl.Series) -> Samples:
+    order = times.arg_sort()
+    step = float(np.median(np.diff(times[order].to_numpy())))
+    return Samples(values[order].to_numpy(), len(times) * step)
 
 
 def _find_families(
@@ -310,10 +322,9 @@ def _find_families(
         for i, j in itertools.combinations(range(len(names)), 2)
         if frozenset((names[i], names[j])) not in untested
     ]
-    sets = connect_groups(pairs)
-    alone = set(range(len(names))) - {i for one in sets for i in one}
+    sets = connect_groups([*pairs, *((i, i) for i in range(len(names)))])
     families: dict[str, tuple[str, ...]] = {}
-    for members in sorted([*sets, *((i,) for i in alone)]):
+    for members in sets:
         datasets = tuple(names[i] for i in members)
         own = compared.labels.filter(pl.col("group").is_in(list(datasets)))
         vehicle = ", ".join(sorted(set(own["vehicle"])))
@@ -322,45 +333,12 @@ def _find_families(
     return families
 
 
-def _group_levels(levels: pl.DataFrame) -> list[Group]:
-    parts = levels.sort("group", "run").partition_by("group", as_dict=True, maintain_order=True)
-    return [
-        Group(str(name), rows[EQUAL_DRIVING].to_numpy(), names=tuple(rows["run"]))
-        for (name,), rows in parts.items()
-    ]
-
-
-def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[str, frozenset[str]], str]:
-    """The effect that carries the difference of two datasets as driven, in words; of diagnosed runs."""
-    diagnosed = {run: one for run, one in compared.manifests.items() if can_read(one, "budget")}
-    rows = read_budgets(replace(compared, manifests=diagnosed))
-    if rows.is_empty():
-        return {}
-    names = name_causes(find_level_names(compared.store))
-    carriers = {}
-    for name in inputs:
-        for pair, one in find_carriers(rows.filter(pl.col("input") == name)).items():
-            cause = names.get(one.name, one.name.replace("_", " "))
-            carriers[name, pair] = f"{cause} {one.difference:+.2g} m/s"
-    return carriers
-
-
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
     """Warn of runs whose recorded command was rescaled: their slip from commands rests on an estimate."""
     doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
     runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
-    if not runs:
-        return []
     text = "read with care, the recorded command had another scale, which was estimated and corrected"
-    return [f"{text} (--input measured does without): {', '.join(runs)}"]
-
-
-def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:
-    known = compared.labels.filter(pl.col("run").is_in(list(samples))).sort("group", "run")
-    return [
-        Group.of_runs(str(name), [samples[run] for run in rows["run"]])
-        for (name,), rows in known.partition_by("group", as_dict=True, maintain_order=True).items()
-    ]
+    return [f"{text} (--input measured does without): {', '.join(runs)}"] if runs else []
 
 
 def _list_levels(datasets: pl.DataFrame, input_name: str, quantity: str) -> pl.DataFrame:
@@ -369,6 +347,8 @@ def _list_levels(datasets: pl.DataFrame, input_name: str, quantity: str) -> pl.D
     if quantity == EQUAL_DRIVING:
         low, high, about = ("equal_low", "equal_high", pl.lit(OVER_RUNS))
     return datasets.filter(pl.col("input") == input_name, pl.col(quantity).is_not_null()).select(
+        pl.lit(input_name).alias("input"),
+        pl.lit(quantity).alias("quantity"),
         "dataset",
         pl.col(quantity).alias("value"),
         pl.col(low).alias("low"),
@@ -379,57 +359,33 @@ def _list_levels(datasets: pl.DataFrame, input_name: str, quantity: str) -> pl.D
 
 def _bound_published(groups: Sequence[Group], families: Mapping[str, Sequence[str]]) -> pl.DataFrame:
     """Value and interval of the published norm, one row per dataset."""
-    rows: list[tuple[str, float, float | None, float | None, str]] = []
+    rows = []
     for datasets in families.values():
         own = [group for group in groups if group.name in datasets]
-        for group, over_runs in zip(own, bound_levels([group.values for group in own]), strict=True):
-            interval, about = over_runs, OVER_RUNS
-            if interval is None and len(group.runs) == 1:
-                interval, about = bound_run(group.runs[0]), THIS_RUN
-            ends = (None, None) if interval is None else (interval.low, interval.high)
-            value = float(np.median(group.values))
-            rows.append((group.name, value, *ends, about if interval else ""))
-    kinds = {
-        "dataset": pl.String,
-        **dict.fromkeys(("value", "low", "high"), pl.Float64),
-        "interval": pl.String,
-    }
-    return pl.DataFrame(rows, schema=kinds, orient="row").sort("dataset")
+        for group, ends in zip(own, bound_groups([group.values for group in own]), strict=True):
+            single = bound_run(group.runs[0]) if len(group.runs) == 1 and ends is None else None
+            about = OVER_RUNS if ends else THIS_RUN if single else ""
+            low, high = ends or single or (None, None)
+            rows.append(
+                ("command", AS_PUBLISHED, group.name, float(np.median(group.values)), low, high, about)
+            )
+    texts = dict.fromkeys(("input", "quantity", "dataset"), pl.String)
+    numbers = dict.fromkeys(("value", "low", "high"), pl.Float64)
+    return pl.DataFrame(rows, schema={**texts, **numbers, "interval": pl.String}, orient="row").sort(
+        "dataset"
+    )
 
 
-def _keys(compared: ComparedRuns) -> dict[str, str]:
-    """Run/generation of every run of a group, separated by spaces."""
-    named = compared.labels.with_columns(pl.concat_str("run", "key", separator="/").alias("place"))
-    joined = named.group_by("group").agg(pl.col("place").sort().str.join(" "))
-    return dict(zip(joined["group"].to_list(), joined["place"].to_list(), strict=True))
-
-
-def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str]:
-    """Notes on pairs without an answer, once for those alike, and on what intervals of single runs say."""
-    if len(groups) < 2:  # noqa: PLR2004 - a pair
-        return ["there is one dataset only: nothing to compare it with"] if groups else []
-    silent = group_by((pair.note, f"{pair.a.name} and {pair.b.name}") for pair in pairs if pair.p is None)
-    sentences = []
-    for note, (first, *others) in sorted(silent.items()):
-        count_text = f", and {format_count(len(others), 'more pair')}" if others else ""
-        sentences.append(f"{first}{count_text}, {of}: {note}")
-    single = sorted({group.name for pair in pairs if pair.unit == BLOCKS for group in (pair.a, pair.b)})
-    if single:
-        sentences.append(
-            f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"
-        )
-    return sentences
-
-
-def _tabulate_windows(samples: Mapping[str, Samples], input_name: str) -> pl.LazyFrame:
-    """Window norms of the published chain in the columns of the table `windows`."""
-    frames = [
-        pl.DataFrame({"window_norm": own.values}).select(
-            pl.lit(run).alias("run"),
-            pl.lit(input_name).alias("input"),
-            pl.lit(value=False).alias("suspect"),
-            "window_norm",
-        )
-        for run, own in samples.items()
-    ]
-    return pl.concat(frames).lazy() if frames else pl.LazyFrame(schema=_WINDOW_COLUMNS)
+def _list_features(compared: ComparedRuns, runs: pl.DataFrame) -> pl.DataFrame:
+    """The table `features`: what can be given away of the runs, whose logs are known by their hash alone."""
+    digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}
+    sha256 = pl.col("run").replace_strict(digests, return_dtype=pl.String)
+    named = runs.with_columns(sha256.alias("sha256")).filter(pl.col("sha256").str.len_chars() == _HASH)
+    given = named.with_columns(
+        pl.col("sha256").str.slice(0, 16).alias("run"),
+        pl.lit(read_version()).alias("made_by"),
+        pl.col("key").alias("from_results"),
+        (pl.col("mass") * pl.col("squared_gyration")).alias("inertia"),
+    )
+    schema = contract_of("features").schema.create_empty().schema
+    return given.select(pl.col(name).cast(kind) for name, kind in schema.items()).sort("sha256", "input")

@@ -6,13 +6,12 @@ levels of runs then compare grounds as if all runs had driven all bins.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD
-from pipeline.datasets.pooled_tests import Errors
+from pipeline.core import FEWEST_OF_SPREAD, Floats
 from pipeline.run import STILL_MPS
 
 SPEED_EDGES = (0.5, 1.0, 1.5, 2.0, 3.0, 6.0, 12.0, 24.0)
@@ -74,19 +73,21 @@ class Levelled:
             driven each; ``bins``: how many it did drive.
         bins: the bins that count, as from `measure_bins`.
         apart: runs that share no driving with the others, and have no level.
-        errors: of the logarithms of the levels, in the order of `runs`.
+        errors: covariance of the errors of the logarithms of the levels, in the order of `runs`, shape (n,
+            n).
     """
 
     runs: pl.DataFrame
     bins: pl.DataFrame
     apart: tuple[str, ...]
-    errors: Errors
+    errors: Floats
 
-    def find_errors(self, runs: Sequence[str]) -> Errors:
-        """Errors of the levels of these runs, in their order."""
+    def find_errors(self, runs: Sequence[str]) -> Floats:
+        """Covariance of the errors of these runs, in their order."""
         own = self.runs["run"].to_list()
         chosen = [own.index(run) for run in runs]
-        return replace(self.errors, shape=self.errors.shape[np.ix_(chosen, chosen)])
+        errors: Floats = self.errors[np.ix_(chosen, chosen)]
+        return errors
 
 
 def level_runs(bins: pl.DataFrame) -> Levelled:
@@ -121,8 +122,8 @@ def level_runs(bins: pl.DataFrame) -> Levelled:
     ).join(counted.group_by("run").agg(pl.len().cast(pl.Int64).alias("bins")), on="run")
     # Of connected runs and bins one effect follows from the others.
     freedom = max(keyed.height - (len(names) + combinations.height - 1), 0)
-    errors = Errors(levels @ levels.T, float(np.sum((moduli - design @ effects) ** 2)), freedom)
-    return Levelled(runs.sort("run"), counted, apart, errors)
+    variance = float(np.sum((moduli - design @ effects) ** 2)) / freedom if freedom else 0.0
+    return Levelled(runs.sort("run"), counted, apart, variance * (levels @ levels.T))
 
 
 def _keep_connected(bins: pl.DataFrame) -> pl.DataFrame:

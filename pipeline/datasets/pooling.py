@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError, group_by
-from pipeline.datasets.rank_tests import Interval
+from pipeline.datasets.pairs import OVER_RUNS, THIS_RUN, bound_groups
 from pipeline.run import MOVING_MPS
 from pipeline.stages import find_fastest
 
@@ -314,27 +314,22 @@ MEASURES = {
     ),
 }
 
-OVER_RUNS = "over runs"
-THIS_RUN = "this run only"
-
 _MEDIANS = (
     "median_modulus", "median_window_norm", "published_norm", "transitory_median_modulus",
     "steady_median_modulus", "drivetrain_mean_square", "ground_mean_square", "cross_mean_square",
     "height_rate", "relative_slip", "slip_energy", "lost_energy", "unpredictability",
     "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
-WHISKER_REACH = 1.5
-"""Maximum length of whiskers in box lengths (Tukey 1977); 0.7 % of normal values lie beyond."""
 _SUMS = ("samples", "windows", "distance", "duration")
-_NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}
+_NO_INTERVALS: Mapping[tuple[str, str], tuple[float, float]] = {}
 
 
 def pool_runs(
     runs: pl.DataFrame,
     by: Sequence[str],
     *,
-    within: Mapping[tuple[str, str], Interval] = _NO_INTERVALS,
-    norms_within: Mapping[tuple[str, str], Interval] = _NO_INTERVALS,
+    within: Mapping[tuple[str, str], tuple[float, float]] = _NO_INTERVALS,
+    norms_within: Mapping[tuple[str, str], tuple[float, float]] = _NO_INTERVALS,
 ) -> pl.DataFrame:
     """Table `datasets`: medians over runs, with intervals over runs.
 
@@ -383,15 +378,13 @@ def pool_runs(
 def _bound_groups(
     grouped: pl.DataFrame,
     column: str,
-    within: Mapping[tuple[str, str], Interval],
+    within: Mapping[tuple[str, str], tuple[float, float]],
     names: tuple[str, str, str],
 ) -> dict[str, pl.Series]:
     """Bounds of the groups' intervals, and whether they are over runs or for this run.
 
     The spread between runs is pooled over the groups of a vehicle.
     """
-    from pipeline.datasets.pooled_tests import bound_levels  # noqa: PLC0415 - heavy
-
     low, high, about = names
     bounds: list[tuple[float | None, float | None, str]] = [(None, None, "")] * grouped.height
     rows = grouped.select("vehicle", pl.col("input").cast(pl.String), "only", column).rows(named=True)
@@ -399,46 +392,14 @@ def _bound_groups(
         ((row["vehicle"], row["input"]), index) for index, row in enumerate(rows) if row[column]
     )
     for indices in families.values():
-        over_runs = bound_levels([np.array(rows[index][column]) for index in indices])
+        over_runs = bound_groups([np.array(rows[index][column]) for index in indices])
         for index, interval in zip(indices, over_runs, strict=True):
             one = within.get((rows[index]["only"], rows[index]["input"]))
             if interval is not None:
-                bounds[index] = (interval.low, interval.high, OVER_RUNS)
+                bounds[index] = (*interval, OVER_RUNS)
             elif one is not None:
-                bounds[index] = (one.low, one.high, THIS_RUN)
+                bounds[index] = (*one, THIS_RUN)
     return {
         name: pl.Series([one[k] for one in bounds], dtype=kind)
         for k, (name, kind) in enumerate(((low, pl.Float64), (high, pl.Float64), (about, pl.String)))
     }
-
-
-def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
-    """Box plot statistics of the 2 s window norms of every group and input.
-
-    Whiskers end at the last window within 1.5 interquartile ranges of the box (Tukey 1977).
-
-    Args:
-        windows: table `windows`; suspect ones are excluded.
-        groups: ``run`` and ``group``.
-
-    Returns:
-        ``group``, ``input``, ``windows``, ``low``, ``q1``, ``median``, ``q3``, ``high`` [m/s].
-    """
-    norm = pl.col("window_norm")
-    first, third = norm.quantile(0.25), norm.quantile(0.75)
-    span = WHISKER_REACH * (third - first)
-    return (
-        windows.filter(~pl.col("suspect"), norm.is_finite())
-        .join(groups.lazy(), on="run")
-        .group_by("group", "input")
-        .agg(
-            pl.len().alias("windows"),
-            norm.filter(norm >= first - span).min().alias("low"),
-            first.alias("q1"),
-            norm.median().alias("median"),
-            third.alias("q3"),
-            norm.filter(norm <= third + span).max().alias("high"),
-        )
-        .sort("median", "group")
-        .collect()
-    )

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pipeline.plan.next_drive import (
         Wish,
         expect,
-        forecast_deployment,
         plan_drive,
         read_command,
         study,

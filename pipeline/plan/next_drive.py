@@ -1,147 +1,22 @@
-"""Plan of the next drive after stored runs, and the forecast from all runs of a vehicle.
+"""Plan of the next drive after stored runs: it answers open questions of their diagnosis."""
 
-The plan answers open questions of their diagnosis; the forecast is of one model fitted jointly to all runs of
-a vehicle.
-"""
-
-import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
-import numpy as np
-
-from pipeline.core import SlipError, format_count
-from pipeline.datasets import (
-    Forecast,
-    expect_values,
-    find_estimates,
-    forecast_vehicle,
-    list_held,
-)
+from pipeline.core import SlipError
+from pipeline.datasets import Expected, expect_run
 from pipeline.estimation import Recording
-from pipeline.estimation.decision import find_cost
-from pipeline.estimation.estimation_data import EstimationData
-from pipeline.estimation.fit import PathFit, fit_path
-from pipeline.estimation.path_residuals import weigh_runs
-from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.logs import LogError, locate_recorded, open_log
-from pipeline.models import Effect, Late, Model, list_effects
+from pipeline.models import list_effects
 from pipeline.plan.manoeuvres import Area, DrivenRange, Limits, choose_limits, is_steered
 from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question, ask_apart, ask_numbers, ask_presence, ask_undecided, list_names
 from pipeline.plan.rehearsal import Knowledge, assume, learn, measure_driven_range
 from pipeline.results import RunDiagnosis, find_refusal, read_suggestion
-from pipeline.run import MotionRun, load_motion_run
-from pipeline.sources import Vehicle, load_vehicle
+from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store, read_choices
-
-MOST_JOINED = 24
-"""Largest number of jointly fitted runs, those on the terrain first: more take longer for the same result."""
-OTHER_GROUND = 0.1
-"""Weight of a run on another terrain, so that runs on the requested terrain dominate and the others determine
-the remaining parameters. The median heading error of seven runs, divided by that of their own models, is 1.29
-with 0.3, 1.22 with 0.1 and 1.21 with 0.03; with 0.03 the largest error grows."""
-
-
-def forecast_deployment(
-    store: Store,
-    vehicle: str,
-    terrain: str,
-    source: Literal["command", "measured"] = "command",
-    *,
-    without: Sequence[str] = (),
-    notify: Callable[[str], object] = str,
-) -> Forecast:
-    """Forecast the parameters of a vehicle on a terrain from the runs of the results.
-
-    The stored models define the effects and the start values of the fit (`forecast_vehicle`). This model is
-    fitted to all runs of the vehicle jointly, each weighted by its own misfit, with less weight for other
-    terrains. An effect that fewer models have is added if it lowers the misfit over all runs. How parameters
-    vary between terrains and runs is that of the single runs (`expect_values`).
-
-    Args:
-        store: the results.
-        vehicle: id of the vehicle.
-        terrain: name of the terrain; it need not have runs.
-        source: input of the model.
-        without: SHA-256 of recordings to exclude, such as those to be predicted.
-        notify: called with a line of progress.
-
-    Raises:
-        SlipError: there is no fleet, or no run of the vehicle.
-    """
-    estimates = find_estimates(store, without=without)
-    start = forecast_vehicle(estimates, vehicle, terrain, source)
-    runs = list(_load_runs(store, start))
-    if not start.numbers or not runs:
-        return start
-    notify(f"fitting {format_count(len(runs), 'run')} jointly")
-    geometry, held = runs[0][1], list_held(estimates, vehicle, source)
-    data = EstimationData([run for run, _ in runs], geometry, Input(source))
-    clocks = [effect for effect in held if effect.late is Late.POSES]
-    shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in data.runs])
-    fits: list[PathFit] = []
-    also: list[str] = []
-    timing = data.start_state().timing
-    for path in (weigh_runs(one, shares) for one in data.paths):
-        mine = [effect for effect in (*start.effects, *clocks) if path.owns(effect)]
-        active = data.active_effects(Model(geometry, tuple(mine)))
-        # The delays of the encoders follow from the body: the drivetrain moves wheels before they report it.
-        state = replace(data.start_state(active), timing=timing)
-        fit = _add_held(fit_path(path, state), held)
-        also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
-        timing = fit.state.timing
-        fits.append(fit)
-    if also:
-        start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
-    return expect_values(start, read_values(data, fits, terrain))
-
-
-def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
-    """Runs of the forecast that have its input, those on its terrain first."""
-    for name in start.runs[:MOST_JOINED]:
-        manifest = store.manifest(name)
-        with contextlib.suppress(SlipError):
-            if manifest is not None:
-                vehicle = load_vehicle(manifest)
-                run = load_motion_run(manifest, vehicle)
-                RunResiduals(run, vehicle, Input(start.input))
-                yield run, vehicle
-
-
-def _add_held(fit: PathFit, held: Sequence[Effect]) -> PathFit:
-    """Extend the fit with effects of some stored models if they lower the misfit over all runs."""
-    for effect in held:
-        taken = any(
-            effect.id == one.id or effect.id in one.contains or one.id in effect.contains
-            for one in fit.state.effects
-        )
-        if taken or not fit.path.owns(effect):
-            continue
-        extended = fit_path(fit.path, fit.state.add(effect))
-        if find_cost(extended) < find_cost(fit):
-            fit = extended
-    return fit
-
-
-def read_values(data: EstimationData, fits: Sequence[PathFit], terrain: str) -> Mapping[str, float]:
-    """Values of the joint fits by label; a terrain parameter has its value on this terrain.
-
-    For a terrain without runs it is the median over the other terrains, which is robust against an unusual
-    one such as ice.
-    """
-    first = {run.terrain: number for number, run in reversed([*enumerate(data.runs)])}
-    runs = [first[terrain]] if terrain in first else [*first.values()]
-    values: dict[str, float] = {}
-    for fit in fits:
-        for number in fit.free:
-            if number.effect:
-                acting = (replace(number, runs=(run,)) for run in runs)
-                values[number.label] = float(np.median([fit.state.get(one) for one in acting]))
-    return values
 
 
 @dataclass(frozen=True)
@@ -151,12 +26,13 @@ class Studied:
     Attributes:
         diagnosis: joint diagnosis of the runs; None without runs.
         knowledge: model and the uncertainty of its parameters.
-        forecast: the fleet's forecast, which the knowledge includes; None if it was not used.
+        expected: what the fleet says of the vehicle on a terrain, which the knowledge includes; None if not
+            used.
     """
 
     diagnosis: RunDiagnosis | None
     knowledge: Knowledge
-    forecast: Forecast | None = None
+    expected: Expected | None = None
 
 
 @dataclass(frozen=True)
@@ -268,28 +144,24 @@ def study(
         return Studied(diagnosis, learn(runs, vehicle, named))
     here = [run for run in runs if run.terrain == terrain]
     # The prior excludes runs that are fitted themselves, and includes those on other terrains.
-    forecast = _forecast(known, vehicle, terrain, without=[run.sha256 for run in here])
+    fleet = expect_run(Store(known), vehicle.id, terrain, without=[run.sha256 for run in here])
     if len(here) < len(runs):
-        expected = assume(vehicle, forecast.effects, forecast.prior).base
-        return Studied(diagnosis, replace(learn(runs, vehicle, named), base=expected, fitted=None), forecast)
-    rest = [effect for effect in forecast.effects if effect.id not in {one.id for one in named}]
-    return Studied(diagnosis, learn(runs, vehicle, [*named, *rest], forecast.prior), forecast)
+        base = assume(vehicle, fleet.effects, fleet.prior).base
+        return Studied(diagnosis, replace(learn(runs, vehicle, named), base=base, fitted=None), fleet)
+    rest = [effect for effect in fleet.effects if effect.id not in {one.id for one in named}]
+    return Studied(diagnosis, learn(runs, vehicle, [*named, *rest], fleet.prior), fleet)
 
 
 def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
-    """Knowledge of a vehicle without a log: the fleet's forecast on a terrain, or the ideal model.
+    """Knowledge of a vehicle without a log: the fleet's numbers on a terrain, or the ideal model.
 
     Raises:
         SlipError: the results contain nothing about the vehicle.
     """
     if terrain is None:
         return Studied(None, assume(vehicle))
-    forecast = _forecast(known, vehicle, terrain)
-    return Studied(None, assume(vehicle, forecast.effects, forecast.prior), forecast)
-
-
-def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str] = ()) -> Forecast:
-    return forecast_deployment(Store(known), vehicle.id, terrain, without=without)
+    fleet = expect_run(Store(known), vehicle.id, terrain)
+    return Studied(None, assume(vehicle, fleet.effects, fleet.prior), fleet)
 
 
 def ask(

@@ -423,7 +423,6 @@ PAGES = {
     "fleet.html": "Fleet",
     "trend.html": "Trends",
     "map.html": "Map",
-    "terrain.html": "Terrain",
 }
 _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 

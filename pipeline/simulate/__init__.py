@@ -34,7 +34,7 @@ from pipeline.simulate.facts import (
     unknown_name,
 )
 from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
-from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
+from pipeline.simulate.path import SLOPE_EFFECTS
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
     INCIDENTS,
@@ -178,7 +178,7 @@ def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
     return 0.5 * uneven * rim, 0.0, -uneven * rim / vehicle.track_width_m
 
 
-_EXTRAS = {"oval_wheel": _ride_oval_wheel, "compacted_snow": CompactedGround(0.3, 0.88, 4.0)}
+_EXTRAS = {"oval_wheel": _ride_oval_wheel}
 
 
 def _change(base: Made, changes: Mapping[str, Any]) -> Made:

@@ -105,17 +105,15 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[run]``: dataset and terrain of the run, and the map of its poses.
+    """``[run]``: dataset and terrain of the run.
 
     Attributes:
         dataset: runs that are evaluated together.
         terrain: name of the terrain.
-        map: name of the map of its localization; runs in one map share positions.
     """
 
     dataset: str | None = None
     terrain: str | None = None
-    map: Annotated[str, msgspec.Meta(min_length=1, max_length=120)] | None = None
 
 
 class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

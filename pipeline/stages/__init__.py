@@ -19,14 +19,7 @@ if TYPE_CHECKING:
     from pipeline.stages.lost_messages import number_gaps
     from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose
     from pipeline.stages.pose_topics import POSE_FINDINGS, SLOW_HZ, Cut
-    from pipeline.stages.reading import (
-        FEWEST_MESSAGES,
-        find_sideways_share,
-        list_wanted,
-        read_fixes,
-        with_texts,
-    )
-    from pipeline.stages.satellite import from_local_plane, to_local_plane
+    from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
     from pipeline.stages.slip_stage import (
         PUBLISHED_SAMPLES,
         SUMMARY_DIGITS,

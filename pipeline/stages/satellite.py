@@ -43,7 +43,7 @@ _GYRO_SCALE: Final = 0.1
 _LEAST_TURNING: Final = 0.03  # rms [rad] of the course's change per second, below which no sensor is aligned
 _MOST_REST: Final = 0.5
 """Fraction of the course's turning that a sensor may leave unexplained; above it, it is on another body."""
-_ROUNDS: Final = 5  # of alternating two linear problems: a skid and an offset, or a plane and an ellipsoid
+_ROUNDS: Final = 5  # of alternating two linear problems: a skid and an offset
 _AGREES: Final = 0.5
 """Fraction of the positions' displacement that velocities over ground may leave unexplained."""
 
@@ -328,22 +328,6 @@ _UNIT: Final = 0.1  # deviation of an orientation's length from one: a sensor wi
 _MOVES_M: Final = 0.05  # [m] per second: an antenna below it is at rest and may repeat its position
 _PARENT: Final = "enu"
 _CHILD: Final = "base_link"
-
-
-def from_local_plane(position: Floats, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Latitude and longitude [deg] of positions on the plane of `to_local_plane`, shape (n,) each.
-
-    Args:
-        position: east and north of the origin [m], shape (n, 2), within a hundred kilometres.
-        origin: its latitude and longitude [deg].
-    """
-    degrees = np.tile(np.array(origin), (position.shape[0], 1))
-    metres = np.radians(1.0) * _SEMI_MAJOR_M * np.array([np.cos(np.radians(origin[0])), 1.0])
-    for _ in range(_ROUNDS):
-        latitude, longitude = np.concatenate((np.array([origin]), degrees)).T
-        there = to_local_plane(latitude, longitude, np.zeros(latitude.size))[1:, :2]
-        degrees = degrees + ((position - there) / metres)[:, ::-1]
-    return degrees[:, 0], degrees[:, 1]
 
 
 def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Floats:

@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.words.check import format_junit, format_markdown, list_lines
-    from pipeline.words.comparison import (
-        Line,
-        PairLine,
-        list_pairs,
-        list_shown_notes,
-        summarize_answer,
-        title_line,
-    )
+    from pipeline.words.check import check_as_json, format_junit, format_markdown, list_lines
+    from pipeline.words.comparison import format_ratio, list_answer, list_shown_notes, summarize_answer
     from pipeline.words.diagnosis import (
         VERDICT,
         describe,

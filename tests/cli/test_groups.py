@@ -30,8 +30,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
     options = {words: list_options(app) for words, app in list_apps(build_app())}
     without = {words for words, names in options.items() if names and "--results" not in names}
     assert without == {
-        "effects", "fleet map merge", "model new", "model new-effect",
-        "model literature", "model show", "simulate",
+        "effects", "model new", "model new-effect", "model literature", "model show", "simulate",
     }  # fmt: skip
 
 

@@ -8,7 +8,6 @@ import pytest
 
 import pipeline
 from pipeline.core.untrusted import format_csv
-from pipeline.report.comparison_page import write_csv
 
 TEXTS = ["=1+1", "+1", "-x", "@x", "\tx", "\rx", "\nx", "\uff1d1", "'=1", "''=1"]
 PLAIN = ["", "a=b", "'x", "x-y", " =1", None]
@@ -33,7 +32,7 @@ def test_other_texts_and_all_numbers_stay() -> None:
 
 def test_tables_of_comparisons_hold_no_formula() -> None:
     frame = pl.DataFrame({"dataset": ["=cmd"], "terrain": ["@ice"], "median": [-0.123456789]})
-    assert write_csv(frame) == "dataset,terrain,median\n'=cmd,'@ice,-0.123457\n"
+    assert format_csv(frame, digits=6) == "dataset,terrain,median\n'=cmd,'@ice,-0.123457\n"
 
 
 def test_one_function_writes_all_csv() -> None:

@@ -1,6 +1,6 @@
 """What a robot does of the body command: judged in a check, and told in the verdict on a run."""
 
-import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +10,8 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.changes import AFTER, BEFORE, Side
-from pipeline.datasets.check import BROKEN, Check, check_as_json, compare
-from pipeline.datasets.check_readings import COMMANDED, MULTIPLIER, RunReading
+from pipeline.datasets.check import BROKEN, compare_sides
+from pipeline.datasets.check_readings import COMMANDED_TURN, MULTIPLIER
 from pipeline.datasets.check_sides import Sides, read_under
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
@@ -22,7 +21,7 @@ from pipeline.simulate import make_scenario, simulate_run, write_log
 from pipeline.sources import Vehicle, find_preset
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.align import measure_body_multiplier
-from pipeline.words.check import format_verdict, list_lines
+from pipeline.words.check import format_verdict
 
 TRACK = 1.8
 EFFECTS = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": TRACK}}
@@ -48,78 +47,29 @@ def sides(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     vehicle, before = drive(folder, request.param, 1.0, 1)
     _, after = drive(folder, request.param, 1.875, 2)
     model = Model(vehicle, tuple(find_effect(name)().change(**values) for name, values in EFFECTS.items()))
-    return read_under(ModelFile(model), {BEFORE: [before], AFTER: [after]})
+    return read_under(ModelFile(model), ([before], [after]))
 
 
-@pytest.fixture(scope="module")
-def found(sides: Sides) -> Check:
-    return compare(sides)
+def test_a_changed_multiplier_is_told_with_what_the_robot_then_does_of_its_command(sides: Sides) -> None:
+    found = compare_sides(sides)
 
-
-def test_a_changed_multiplier_is_told_with_what_the_robot_then_does_of_its_command(found: Check) -> None:
-    verdict = format_verdict(found)
-
-    assert verdict.startswith("The robot turns at 56 -> 104 % of the commanded rate: better; ")
-    assert "the controller's multiplier 1" in verdict
-    assert found.list_status("changed") == [MULTIPLIER]
-    assert found.changes["effective_track.k"].status == "unchanged"
+    numbers = {one.name: one for one in found.numbers}
+    assert [one.name for one in found.list_status("changed")] == [MULTIPLIER]
+    assert re.search(r"controller's multiplier 1(\.0\d)? -> 1\.8\d", format_verdict(found))
+    assert numbers["effective_track.k"].status == "unchanged"
+    turned = numbers[COMMANDED_TURN]
+    assert (turned.before, turned.after) == pytest.approx((1.0 / TRACK, 1.875 / TRACK), rel=0.01)
     assert found.code == BROKEN
-    assert ("commanded", "the robot turns at 56 -> 104 % of the commanded yaw rate") in list_lines(found)
-    told = check_as_json(found, list_lines(found))["commanded_turn"]
-    assert isinstance(told, dict)
-    assert told["before"] == pytest.approx(1.0 / TRACK, rel=0.01)
-    assert told["after"] == pytest.approx(1.875 / TRACK, rel=0.01)
-
-
-def test_the_other_way_round_it_is_worse(sides: Sides) -> None:
-    swapped = replace(
-        sides,
-        before=tuple(replace(one, numbers=replace(one.numbers, side=BEFORE)) for one in sides.after),
-        after=tuple(replace(one, numbers=replace(one.numbers, side=AFTER)) for one in sides.before),
-    )
-
-    assert "104 -> 56 % of the commanded rate: worse" in format_verdict(compare(swapped))
-
-
-def test_a_multiplier_that_stays_is_no_question(sides: Sides) -> None:
-    again = tuple(replace(one, numbers=replace(one.numbers, side=AFTER)) for one in sides.before)
-    check = compare(replace(sides, after=again))
-
-    assert not {*COMMANDED} & {*check.changes}
-    assert "commanded rate" not in format_verdict(check)
-
-
-@pytest.mark.parametrize("runs", [1, 16])
-@pytest.mark.parametrize(("share", "status"), [(0.02, "unchanged"), (0.2, "changed")])
-def test_more_runs_do_not_make_two_percent_of_a_multiplier_a_change(
-    sides: Sides, runs: int, share: float, status: str
-) -> None:
-    index = sides.names.index(MULTIPLIER)
-
-    def turn(side: Side, by: float) -> tuple[RunReading, ...]:
-        (one,) = sides.before
-        values = one.numbers.values.copy()
-        values[index] += math.log1p(by)
-        return (replace(one, numbers=replace(one.numbers, side=side, values=values)),) * runs
-
-    check = compare(replace(sides, before=turn(BEFORE, 0.0), after=turn(AFTER, share)))
-
-    assert check.changes[MULTIPLIER].status == status
 
 
 def test_without_a_body_command_nothing_is_said_of_it(sides: Sides) -> None:
-    def hide(*runs: object) -> tuple[object, ...]:
-        hidden = []
-        for one in runs:
-            values = one.numbers.values.copy()  # type: ignore[attr-defined]
-            values[[sides.names.index(name) for name in COMMANDED]] = np.nan
-            hidden.append(replace(one, numbers=replace(one.numbers, values=values)))  # type: ignore[type-var, attr-defined]
-        return tuple(hidden)
-
-    check = compare(replace(sides, before=hide(*sides.before), after=hide(*sides.after)))  # type: ignore[arg-type]
-
-    assert check.commanded is None
-    assert not {*COMMANDED} & {*check.changes}
+    hidden = [
+        tuple(replace(one, estimates={"drive_lag.tau": one.estimates["drive_lag.tau"]}) for one in side)
+        for side in (sides.before, sides.after)
+    ]
+    found = compare_sides(replace(sides, before=hidden[0], after=hidden[1]))
+    assert {one.name: one.status for one in found.numbers}[MULTIPLIER] == "unknown"
+    assert "multiplier" not in format_verdict(found)
 
 
 @pytest.mark.parametrize("expected", [1.5, None], ids=["obeyed", "another"])

@@ -7,7 +7,7 @@ import pytest
 from verbs import ask_verb, run_slip
 
 from pipeline.datasets import ComparisonError
-from pipeline.datasets.deployments import find_own_table, rate_name, read_deployments
+from pipeline.datasets.deployments import find_own_table, rate_names, read_deployments
 from schemas import FEATURES
 
 ENTRY = {
@@ -34,7 +34,7 @@ def test_the_own_table_keeps_its_schema_and_says_how_well_each_value_is_known(sa
     [("asphalt", 0.0), ("tile", 1.5), ("gravel", 3.9), ("ice", 6.0), ("Deep snow", 9.2), ("moon", None)],
 )
 def test_the_scale_puts_its_anchors_where_they_are(terrain: str, wanted: float | None) -> None:
-    found = rate_name(terrain)
+    (found,) = rate_names([terrain])
     assert found == (None if wanted is None else pytest.approx(wanted, abs=0.05))
 
 

@@ -13,9 +13,7 @@ from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.deployments import draw_up_map
 from pipeline.datasets.trend import follow_trend
 from pipeline.report import render_catalogue
-from pipeline.report.comparison_page import write_answer
-from pipeline.report.map_page import write_map
-from pipeline.report.trend_page import write_trend
+from pipeline.report.datasets_page import write_answer, write_map, write_trend
 from pipeline.store import Store
 
 DAY_NS = 86_400_000_000_000
@@ -75,11 +73,11 @@ def render_pages(folder: Path, name: str) -> dict[str, str]:
         )
         write_run(store, run)
     answer = compare_results(store, Question())
-    trend = follow_trend(store, by=("vehicle",), threshold=0.1, limits={})
+    trend = follow_trend(store, ("vehicle",))
     return {
         "comparison": write_answer(store, answer)["comparison.html"].read_text(encoding="utf-8"),
-        "map": write_map(store, draw_up_map(store)).read_text(encoding="utf-8"),
-        "trend": write_trend(store, trend).read_text(encoding="utf-8"),
+        "map": write_map(store, draw_up_map(store))["map.html"].read_text(encoding="utf-8"),
+        "trend": write_trend(store, trend)["trend.html"].read_text(encoding="utf-8"),
         "catalogue": render_catalogue(store),
     }
 

@@ -1,22 +1,22 @@
 """Grounds at equal driving: what the driving did falls away, and what cannot be compared has no number."""
 
+import itertools
 import shutil
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from comparison_store import Run, make_budget, write_run
+from comparison_store import Run, write_run
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compare import AS_DRIVEN, EQUAL_DRIVING, Answer, compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
-from pipeline.datasets.pairs import Answer, foresee_pairs
-from pipeline.datasets.pooled_tests import Errors, compare_means
+from pipeline.datasets.levels import fit_levels
 from pipeline.store import Store
-from pipeline.words.comparison import list_lines, list_pairs
+from pipeline.words import list_answer
 
 RATE = 20.0
 FACTORS = {"command": 1.0, "measured": 0.5}
@@ -110,8 +110,8 @@ def test_random_halves_of_one_ground_alarm_once_in_twenty() -> None:
             ("as driven", medians["modulus"].to_numpy()),
         ):
             for _ in range(splits):
-                a, b = np.split(rng.permutation(np.log(values)), [3])
-                alarms[what] += compare_means([a, b], [(0, 1)]).differences[0].p_adjusted <= 0.05
+                fit = fit_levels(rng.permutation(np.log(values)), ["a"] * 3 + ["b"] * 4)
+                alarms[what] += fit.compare("a", "b").p <= 0.05
     for what, count in alarms.items():
         # Splits of the same runs are not independent: the error is that of the draws, at most.
         assert 0.01 <= count / (draws * splits) <= 0.05 + 2.6 * np.sqrt(0.05 * 0.95 / draws / 5), what
@@ -137,21 +137,16 @@ def draw_bins(
 def test_a_ground_with_one_run_of_two_cells_alarms_once_in_twenty(between: float) -> None:
     """Its level is known much less than those of others: a spread pooled over runs alarmed in a third."""
     rng, draws = np.random.default_rng(6), 150
-    cells, sizes = [25, 25, 25, 25, 25, 25, 2], [3, 3, 1]
-    truth = np.repeat([0.0, 0.7, -0.4], sizes)
+    cells, groups = [25, 25, 25, 25, 25, 25, 2], ["a", "a", "a", "b", "b", "b", "c"]
+    truth = {"a": 0.0, "b": 0.7, "c": -0.4}
     missed = {"weighed": 0, "alike": 0}
     for _ in range(draws):
-        levelled = level_runs(draw_bins(rng, cells, truth.tolist(), between))
-        groups = np.split(np.log(levelled.runs["level"].to_numpy()), [3, 6])
-        pairs = [(0, 1), (0, 2), (1, 2)]
+        levelled = level_runs(draw_bins(rng, cells, [truth[name] for name in groups], between))
+        values = np.log(levelled.runs["level"].to_numpy())
         for what, errors in (("weighed", levelled.errors), ("alike", None)):
-            test = compare_means(groups, pairs, errors=errors)
-            for (i, j), one in zip(pairs, test.differences, strict=True):
-                true = [0.0, 0.7, -0.4][j] - [0.0, 0.7, -0.4][i]
-                assert one.interval is not None
-                if not one.interval.low <= true <= one.interval.high:
-                    missed[what] += 1
-                    break
+            fit = fit_levels(values, groups, errors)
+            pairs = [(a, b, fit.compare(a, b, 3)) for a, b in ("ab", "ac", "bc")]
+            missed[what] += any(not one.low <= truth[b] - truth[a] <= one.high for a, b, one in pairs)
     assert missed["weighed"] / draws <= 0.05 + 2.6 * np.sqrt(0.05 * 0.95 / draws)
     if not between:
         assert missed["alike"] > 5 * missed["weighed"], "which is what errors of cells are for"
@@ -159,64 +154,16 @@ def test_a_ground_with_one_run_of_two_cells_alarms_once_in_twenty(between: float
 
 def test_runs_of_few_cells_hide_nothing_that_the_others_tell() -> None:
     """Of three runs of each ground one has three cells: a factor of 1.5 is found nearly always."""
-    rng, draws = np.random.default_rng(8), 40
+    rng, draws, groups = np.random.default_rng(8), 40, ["a"] * 3 + ["b"] * 3 + ["c"] * 3
     found = {"weighed": 0, "alike": 0}
     for _ in range(draws):
         bins = draw_bins(rng, [25, 25, 3, 25, 25, 3, 25, 25, 3], [0.0] * 3 + [0.1] * 3 + [0.4] * 3, 0.02)
         levelled = level_runs(bins)
-        groups = np.split(np.log(levelled.runs["level"].to_numpy()), [3, 6])
         for what, errors in (("weighed", levelled.errors), ("alike", None)):
-            found[what] += (
-                compare_means(groups, [(0, 1), (0, 2), (1, 2)], errors=errors).differences[1].p_adjusted
-                <= 0.05
-            )
+            fit = fit_levels(np.log(levelled.runs["level"].to_numpy()), groups, errors)
+            found[what] += fit.compare("a", "c", 3).p_adjusted <= 0.05
     assert found["weighed"] >= 0.9 * draws
     assert found["alike"] < found["weighed"]
-
-
-def test_values_that_are_known_exactly_are_compared_by_tukey_and_kramer() -> None:
-    rng = np.random.default_rng(2)
-    groups = [rng.normal(0.1 * i, 0.1, size) for i, size in enumerate((3, 4, 1))]
-    pairs = [(0, 1), (0, 2), (1, 2)]
-    nearly = Errors(1e-6 * np.diag(rng.uniform(0.5, 2.0, 8)), 9.0, 100)
-    weighed, plain = compare_means(groups, pairs, errors=nearly), compare_means(groups, pairs)
-    assert plain.method.startswith("Tukey-Kramer")
-    assert weighed.spread == pytest.approx(plain.spread, rel=1e-3)
-    for one, other in zip(weighed.differences, plain.differences, strict=True):
-        assert one.value == pytest.approx(other.value, abs=1e-4)
-        assert one.p_adjusted == pytest.approx(other.p_adjusted, abs=0.02)
-        assert one.p == pytest.approx(other.p, abs=0.02)
-        assert one.interval is not None
-        assert other.interval is not None
-        assert one.interval.low == pytest.approx(other.interval.low, rel=0.05)
-
-
-def test_the_runs_that_would_tell_are_foreseen() -> None:
-    """Spread .2, three grounds of two runs: what is foreseen is what drawn runs of that many show."""
-    rows = [
-        {
-            "a": a, "b": b, "runs_a": 2, "runs_b": 2, "ratio": float(np.exp(log)), "spread": 0.2,
-            "freedom": 3, "p_adjusted": 0.3, "smallest_p": 0.0, "unit_of_analysis": "runs",
-        }
-        for a, b, log in (("ice", "mud", 0.0), ("grass", "ice", 0.6), ("grass", "mud", 0.6))
-    ]  # fmt: skip
-    (foreseen,) = foresee_pairs(rows)
-    assert set(foreseen.pairs) == {("grass", "ice"), ("grass", "mud")}
-    rng, size = np.random.default_rng(3), 2 + foreseen.added
-    counts = []
-    for count in (size - 1, size):
-        limit = []
-        for _ in range(100):
-            groups = [rng.normal(mean, 0.2, count) for mean in (0.0, 0.6, 0.6)]
-            limit += [
-                one.p_adjusted <= 0.05 for one in compare_means(groups, [(0, 1), (0, 2)], tests=9).differences
-            ]
-        counts.append(np.mean(limit))
-    assert counts[0] < 0.5 < counts[1] + 0.1
-    sure = [{**row, "p_adjusted": 0.01} for row in rows]
-    assert foresee_pairs(sure) == [], "half of the pairs are known"
-    assert foresee_pairs([{**row, "spread": None, "freedom": None} for row in rows]) == []
-    assert foresee_pairs([{**row, "ratio": 1.0} for row in rows]) == [], "what does not differ, no run shows"
 
 
 @pytest.fixture
@@ -238,46 +185,26 @@ def answer(tmp_path: Path) -> Answer:
 
 
 def test_both_questions_are_answered_on_both_inputs_within_a_vehicle(answer: Answer) -> None:
-    lines = list_lines(answer)
-    kinds = ("as driven", "at equal driving", "the difference")
-    assert [(line.family, line.input, line.driving) for line in lines] == [
-        *(("husky", name, "as driven") for name in FACTORS),
-        *(("warthog", "command", kind) for kind in (*kinds[:2], "the ground alone", kinds[2])),
-        *(("warthog", "measured", kind) for kind in kinds),
-    ]
-    assert lines[4].text == f"{lines[7].text} (from wheel encoders)"
-    assert lines[0].text.endswith(" m/s")
-    assert lines[2].text.startswith("ice (1.5 m/s) hardest, ")
-    assert "; 2 of 3 pairs significant" in lines[2].text
-    assert lines[3].text.startswith("ice 3.")
-    assert {(view.input, view.quantity) for view in answer.views} == {
-        (name, quantity) for name in FACTORS for quantity in ("median_modulus", "equal_modulus")
-    }
-    pairs = list_pairs(answer, "command")
-    assert [one.is_equal_sure for one in pairs] == [True, True, False]
-    assert {one.hard for one in pairs[:2]} == {"warthog_ice"}
-    assert {frozenset((one.hard, one.easy)) for one in pairs} == {
-        frozenset(f"warthog_{name}" for name in names)
-        for names in (("asphalt", "gravel"), ("asphalt", "ice"), ("gravel", "ice"))
-    }, "no pair of two vehicles"
-
-
-def test_the_effect_that_carries_a_difference_is_named_with_and_without_estimates(tmp_path: Path) -> None:
-    store = Store(tmp_path / "results")
-    for i in range(2):
-        for terrain, skid in (("gravel", 0.1), ("ice", 2.1)):
-            budget = make_budget({"effective_track": 0.3, "lateral_skid": skid, "disturbance": 0.1})
-            dataset = f"warthog_{terrain}"
-            write_run(
-                store, Run(name=f"{terrain}_{i}", dataset=dataset, terrain=terrain, budget=budget), seed=i
-            )
-    (pair,) = list_pairs(compare_results(store, Question()), "measured")
-    # sqrt(2.5) - sqrt(0.5) = 0.87 m/s, and skid is all of it.
-    assert pair.carrier == "lateral skid +0.87 m/s"
-    assert list_pairs(compare_results(store, Question()), "command")[0].carrier == ""
-    runs = list_lines(compare_results(store, Question(by=("run",))))
-    assert "at equal driving" in {line.driving for line in runs}
-    assert "to know more" not in {line.driving for line in runs}, "no run can be driven again"
+    lines = list_answer(answer)
+    kinds = ("as driven", "at equal driving")
+    assert sorted(line[:2] for line in lines) == sorted(
+        (f"{vehicle}, {words}", kind)
+        for vehicle in ("husky", "warthog")
+        for words in ("from commands", "from wheel encoders")
+        for kind in kinds
+    )
+    texts = {line[:2]: line[2] for line in lines}
+    assert texts["husky, from commands", "as driven"].endswith(" m/s")
+    assert texts["warthog, from commands", "as driven"].startswith("warthog_ice (1.5 m/s) hardest, ")
+    assert texts["warthog, from commands", "as driven"].endswith("; 2 of 3 pairs significant")
+    assert texts["warthog, from commands", "at equal driving"].startswith("warthog_ice 3.")
+    assert set(answer.views) == {(name, kind) for name in FACTORS for kind in (AS_DRIVEN, EQUAL_DRIVING)}
+    pairs = answer.take(answer.comparisons, ("command", EQUAL_DRIVING))
+    names = [f"warthog_{name}" for name in ("asphalt", "gravel", "ice")]
+    assert set(pairs.select("a", "b").rows()) == set(itertools.combinations(names, 2)), "of one vehicle"
+    sure = pairs.filter(pl.col("p_adjusted") <= 0.05)
+    assert set(sure["b"]) == {"warthog_ice"}
+    assert sure.height == 2
 
 
 def test_the_levels_stand_in_the_table_of_datasets(answer: Answer) -> None:
@@ -296,15 +223,15 @@ def test_runs_of_one_ground_agree_better_at_equal_driving_on_recordings(
         run = analyze_log(log, Options(out=recorded_results, report=False)).manifest.folder.parent
         shutil.copytree(run, store.root / run.relative_to(recorded_results), symlinks=True)
     answer = compare_results(store, Question(vehicle="warthog"))
+    views = {
+        view: (answer.take(answer.levels, view), answer.take(answer.comparisons, view))
+        for view in answer.views
+    }
     for name, ratio in (("command", 0.4), ("measured", 0.6)):
-        driven, equal = (answer.find_view(name, equal=one) for one in (False, True))
-        assert driven is not None
-        assert equal is not None
-        assert equal.comparisons["spread"][0] < ratio * driven.comparisons["spread"][0]
-        assert equal.levels.sort("value")["dataset"][-1] == "warthog_ice"
-    order = equal.levels.sort("value", descending=True)["dataset"].to_list()
+        (_, driven), (levels, equal) = (views[name, kind] for kind in (AS_DRIVEN, EQUAL_DRIVING))
+        assert equal["spread"][0] < ratio * driven["spread"][0]
+        assert levels.sort("value")["dataset"][-1] == "warthog_ice"
+    order = levels.sort("value", descending=True)["dataset"].to_list()
     assert order == [f"warthog_{ground}" for ground in ("ice", "sand", "gravel", "asphalt", "grass")]
-    grass = {frozenset((row["a"], row["b"])): row for row in driven.comparisons.iter_rows(named=True)}
-    pair = frozenset(("warthog_grass", "warthog_ice"))
-    assert grass[pair]["p_adjusted"] <= 0.05, "driven gently, grass looks easier"
-    assert equal.comparisons["p_adjusted"].min() > 0.05  # type: ignore[operator]
+    grass = driven.filter(pl.col("a") == "warthog_grass", pl.col("b") == "warthog_ice")
+    assert grass["p_adjusted"].item() <= 0.05, "driven gently, grass looks easier"

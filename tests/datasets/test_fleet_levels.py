@@ -1,6 +1,5 @@
 """Numbers of a fleet by level: the vehicle's, the ground's, a run's own, or open."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,15 +7,13 @@ import numpy as np
 import polars as pl
 import pytest
 from comparison_store import Run, write_run
-from verbs import run_slip
+from verbs import ask_verb
 
-from pipeline.batch.batch_plan import refresh_pools
 from pipeline.datasets.compare import compare_results
 from pipeline.datasets.compared_runs import Question
-from pipeline.datasets.forecast import FleetNumber, fit_fleet
-from pipeline.datasets.prediction import fit_results
+from pipeline.datasets.fleet import FleetNumber, expect_numbers, fit_fleet, fit_results
+from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.trend import follow_trend
-from pipeline.models.parameter import Level
 from pipeline.store import Store
 
 ERROR = 0.02
@@ -67,16 +64,15 @@ def fit_one(estimates: pl.DataFrame) -> FleetNumber:
 
 def test_wheels_that_are_small_are_so_on_every_ground() -> None:
     number = fit_one(draw(ALIKE))
-    assert (number.level, number.name) == (Level.VEHICLE, "wheel_radius")
-    assert number.fit.interval is not None
-    assert number.fit.interval.low < 0.9 < number.fit.interval.high
+    assert (number.level, number.name) == ("vehicle", "wheel_radius")
+    assert float(str(number.whole.low)) < 0.9 < float(str(number.whole.high))
     assert "3 terrains not shown to differ by more than runs do" in number.because
 
 
 def test_wheels_that_slip_on_ice_are_not_small() -> None:
     number = fit_one(draw(ICE_AND_OTHERS))
-    assert (number.level, number.name) == (Level.TERRAIN, "longitudinal_slip")
-    assert number.fit.groups["ice"].value == pytest.approx(0.7, abs=0.05)
+    assert (number.level, number.name) == ("terrain", "longitudinal_slip")
+    assert number.terrains["ice"].value == pytest.approx(0.7, abs=0.05)
     assert "ice 0.7" in number.because
 
 
@@ -84,7 +80,7 @@ def test_wheels_that_slip_on_ice_are_not_small() -> None:
 def test_radius_is_never_named_for_slip_where_two_terrains_are_there(seed: int) -> None:
     for runs in (1, 2, 3):
         number = fit_one(draw({"asphalt": 1.0, "ice": 0.7}, runs=runs, seed=seed))
-        assert number.level in {Level.TERRAIN, None}
+        assert number.level in {"terrain", None}
         assert number.name in {"longitudinal_slip", "wheel_radius or longitudinal_slip"}
 
 
@@ -94,8 +90,8 @@ def test_what_comes_and_goes_is_the_runs_own() -> None:
             dict.fromkeys(ICE_AND_OTHERS, 0.0), effect="yaw_misalignment", parameter="psi", spread=0.2, runs=5
         )
     )
-    assert number.level is Level.RUN
-    assert number.fit.spread_run == pytest.approx(0.2, rel=0.5)
+    assert number.level == "run"
+    assert number.spread_run == pytest.approx(0.2, rel=0.5)
 
 
 def test_one_terrain_leaves_it_open_and_says_what_would_tell() -> None:
@@ -106,38 +102,108 @@ def test_one_terrain_leaves_it_open_and_says_what_would_tell() -> None:
     assert number.because == expected
 
 
-def test_a_damaged_run_is_told_apart_and_leaves_the_others_as_they_are() -> None:
-    rows = draw(ALIKE, runs=4)
-    damaged = rows["run"][2]
-    hurt = rows.with_columns(pl.when(pl.col("run") == damaged).then(0.5).otherwise("value").alias("value"))
-    number = fit_one(hurt)
-    assert number.odd == (damaged,)
-    assert damaged not in number.runs
-    assert number.level is Level.VEHICLE
-    assert number.fit.value == pytest.approx(0.9, abs=0.02)
-    assert fit_one(rows).odd == ()
-
-
 def test_only_what_is_named_counts_and_of_the_runs_whose_model_holds_it() -> None:
     elsewhere = {"asphalt": 1.0, "gravel": 1.0}
     quiet = draw(elsewhere, named=False)
     assert fit_fleet(quiet).numbers == ()
     number = fit_one(pl.concat([quiet, draw({"ice": 0.7})]))
-    assert (number.named, len(number.runs)) == (3, 3)
-    assert number.level is None
-    assert number.because.endswith("; not in the models of 6 other runs")
+    assert (number.named, number.whole.runs, number.level) == (3, 3, None)
     held = fit_one(pl.concat([draw(elsewhere, named=False, in_model=True), draw({"ice": 0.7})]))
-    assert (held.named, len(held.runs), held.name) == (3, 9, "longitudinal_slip")
+    assert (held.named, held.whole.runs, held.name) == (3, 9, "longitudinal_slip")
 
 
 def test_an_interval_of_a_fleet_takes_three_runs() -> None:
     for runs, known in ((1, False), (2, False), (3, True)):
         number = fit_one(draw({"ice": 0.7}, runs=runs))
-        assert (number.fit.interval is not None) == known
-        assert (number.fit.groups["ice"].interval is not None) == known
+        assert (number.whole.low is not None) == known
+        assert (number.terrains["ice"].low is not None) == known
     mixed = fit_one(pl.concat([draw(ALIKE), draw({"mud": 0.7}, runs=2)]))
-    assert mixed.fit.groups["mud"].interval is None
-    assert mixed.fit.groups["ice"].interval is not None
+    assert mixed.terrains["mud"].low is None
+    assert mixed.terrains["ice"].low is not None
+
+
+def test_a_band_of_another_run_is_wider_than_the_level_and_that_of_another_ground_wider_still() -> None:
+    number = fit_one(draw(ICE_AND_OTHERS, spread=0.05, runs=5))
+    ice, whole = number.terrains["ice"], number.whole
+    low, high, another_low, another_high = (
+        float(str(getattr(ice, key))) for key in ("low", "high", "another_low", "another_high")
+    )
+    assert another_low < low < ice.value < high < another_high
+    assert float(str(whole.another_low)) < another_low
+    assert float(str(whole.another_high)) > 1.0
+
+
+def test_bands_hold_other_runs_as_often_as_they_say() -> None:
+    rng, inside, fleets = np.random.default_rng(2), 0, 200
+    for seed in range(fleets):
+        number = fit_one(draw(ICE_AND_OTHERS, spread=0.05, seed=seed))
+        ice = number.terrains["ice"]
+        another = 0.7 + 0.05 * rng.normal()
+        inside += float(str(ice.another_low)) <= another <= float(str(ice.another_high))
+    assert 0.91 <= inside / fleets <= 0.99
+
+
+def test_what_is_expected_of_another_run_is_the_level_of_its_ground() -> None:
+    estimates = draw(ICE_AND_OTHERS)
+    ice, mud = (expect_numbers(estimates, "warthog", terrain, "measured") for terrain in ("ice", "mud"))
+    assert ice.effects[0].values["k"] == pytest.approx(0.7, abs=0.03)
+    assert (len(ice.here), len(ice.elsewhere)) == (3, 6)
+    assert mud.effects[0].values["k"] == pytest.approx(0.89, abs=0.03)
+    assert mud.prior["wheel_radius.k"][1] > 2.0 * ice.prior["wheel_radius.k"][1]
+    with pytest.raises(ComparisonError, match="no other run of jackal"):
+        expect_numbers(estimates, "jackal", "ice")
+
+
+def test_the_expected_model_has_what_half_of_the_runs_there_have_and_no_clock() -> None:
+    skid = {"effect": "lateral_skid", "parameter": "c", "unit": "s"}
+    lag = {"effect": "drive_lag", "parameter": "tau", "unit": "s", "input": "command"}
+    parts = [
+        draw(ALIKE),
+        draw({"ice": 0.1}, **skid),
+        draw({"asphalt": 0.0, "gravel": 0.0}, **skid, named=False),
+        draw(dict.fromkeys(ALIKE, 0.3), **lag),
+        draw(dict.fromkeys(ALIKE, 0.2), effect="clock_offset", parameter="d", unit="s"),
+        draw(dict.fromkeys(ALIKE, 5.0), effect="terrain_change", parameter="at_s", unit="s"),
+    ]
+    ids = {
+        (terrain, source): [
+            one.id for one in expect_numbers(pl.concat(parts), "warthog", terrain, source).effects
+        ]
+        for terrain in ("ice", "gravel", "mud")
+        for source in ("command", "measured")
+    }
+    assert ids["ice", "command"] == ["drive_lag", "wheel_radius", "lateral_skid"]
+    assert ids["ice", "measured"] == ["wheel_radius", "lateral_skid"]
+    assert ids["gravel", "command"] == ids["mud", "command"] == ["drive_lag", "wheel_radius"]
+
+
+def test_numbers_of_the_controller_are_the_vehicles_and_friction_is_the_grounds() -> None:
+    servo = pl.concat(
+        [
+            draw(
+                dict.fromkeys(("asphalt", "gravel"), value),
+                effect="wheel_servo",
+                parameter=name,
+                input="command",
+            )
+            for name, value in (("tau", 0.7), ("scrub", 0.8))
+        ]
+    )
+    gravel, mud = (expect_numbers(servo, "warthog", terrain).prior for terrain in ("gravel", "mud"))
+    assert mud["wheel_servo.tau"] == pytest.approx(gravel["wheel_servo.tau"])
+    assert mud["wheel_servo.scrub"][1] > 1.2 * gravel["wheel_servo.scrub"][1]
+    (tau,) = (one for one in fit_fleet(servo).numbers if one.parameter == "tau")
+    assert (tau.level, tau.because) == ("vehicle", "by its nature the vehicle's")
+
+
+def test_poses_that_gyros_have_dated_are_no_body_that_is_late() -> None:
+    names = {}
+    for in_model in (False, True):
+        clock = {"effect": "clock_offset", "parameter": "d", "unit": "s", "in_model": in_model}
+        (number,) = fit_fleet(draw({"asphalt": 0.1, "ice": 0.4}, **clock)).numbers
+        names[in_model] = (number.name, number.candidates)
+    assert names[False] == ("clock_offset", ("clock_offset",))
+    assert names[True] == ("body_inertia", ("clock_offset", "body_inertia"))
 
 
 def fill_slippery(store: Store, *, sibling: float, radius: float = 0.3) -> None:
@@ -153,7 +219,7 @@ def fill_slippery(store: Store, *, sibling: float, radius: float = 0.3) -> None:
 def test_a_data_sheet_is_judged_over_the_runs_of_a_robot(tmp_path: Path) -> None:
     store = Store(tmp_path / "results")
     fill_slippery(store, sibling=0.9)
-    model, _ = fit_results(store)
+    model = fit_results(store)
     assert len(model.runs["warthog"]) == 6
     said = "slippery ground and no wrong wheel radius, by other runs of the same vehicle: ice_0, ice_1, ice_2"
     assert said in model.notes
@@ -169,7 +235,7 @@ def test_siblings_that_do_not_contradict_it_leave_a_wrong_radius_wrong(
     """With .6 the radius may be the cause of both, 1.4 is no grip, and with 0 the gain is not known."""
     store = Store(tmp_path / "results")
     fill_slippery(store, sibling=sibling)
-    assert len(fit_results(store)[0].runs["warthog"]) == 3
+    assert len(fit_results(store).runs["warthog"]) == 3
     notes = compare_results(store, Question()).notes
     assert "left out, finding wheel_radius_wrong (3 runs): ice_0, ice_1, ice_2" in notes
 
@@ -180,10 +246,10 @@ def test_simulated_runs_enter_no_fleet_and_no_trend_of_recordings(results: Store
         Run(name="made", terrain="mud", estimates=[("wheel_radius", "k", 0.1, ERROR)], simulated=True),
     )
     said = "left out, simulated, and never pooled with recordings: made"
-    model, _ = fit_results(results)
+    model = fit_results(results)
     assert "made" not in model.runs["warthog"]
     assert said in model.notes
-    trend = follow_trend(results, ("vehicle",), threshold=0.05, limits={})
+    trend = follow_trend(results, ("vehicle",))
     assert said in trend.notes
     assert not any("made" in key for key in trend.keys)
 
@@ -201,16 +267,16 @@ def results(tmp_path: Path) -> Store:
     return store
 
 
-def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
-    results: Store,
-) -> None:
-    refresh_pools(results)
-    assert not (results.root / "fleet.json").exists()
-    run_slip("fleet", "fit", str(results.root))
-    write_run(
-        results, Run(name="new", terrain="mud", seconds=6.0, estimates=[("wheel_radius", "k", 0.9, ERROR)])
+def test_the_verb_writes_the_table_that_it_shows(results: Store) -> None:
+    shown = ask_verb("fleet", "show", results.root)
+    assert not (results.root / "fleet.parquet").exists()
+    written = ask_verb("fleet", "fit", results.root)
+    assert written["parameters"] == shown["parameters"]
+    table = pl.read_parquet(results.root / "fleet.parquet")
+    assert table["terrain"].to_list() == ["*", "asphalt", "gravel", "ice"]
+    assert set(shown["parameters"][0]["terrains"]) == {"asphalt", "gravel", "ice"}
+    (resolved,) = shown["resolved"]
+    assert (resolved["candidates"], resolved["answer"]) == (
+        ["wheel_radius", "longitudinal_slip"],
+        "longitudinal_slip",
     )
-    refresh_pools(results)
-    shown = json.loads(run_slip("fleet", "show", str(results.root), "--json")[1])
-    assert "mud" in shown["parameters"][0]["terrains"]
-    assert not any("have changed since" in note for note in shown["notes"])

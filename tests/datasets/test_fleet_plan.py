@@ -40,14 +40,14 @@ def _find() -> Vehicle:
     return vehicle
 
 
-def test_what_is_known_is_the_forecast_with_its_spread(results: Path) -> None:
+def test_what_is_known_is_what_the_fleet_lets_expect(results: Path) -> None:
     vehicle = _find()
     spread = {}
     for terrain in ("ice", "gravel", "mud"):
         studied = expect(vehicle, terrain, results)
-        knowledge, forecast = studied.knowledge, studied.forecast
-        assert forecast is not None
-        (mean, deviation) = forecast.prior["effective_track.k"]
+        knowledge, expected = studied.knowledge, studied.expected
+        assert expected is not None
+        (mean, deviation) = expected.prior["effective_track.k"]
         assert knowledge.base.names == {"effective_track"}
         assert knowledge.base.values.tolist() == [mean]
         assert np.linalg.inv(knowledge.base.information)[0, 0] ** 0.5 == pytest.approx(deviation)

@@ -10,8 +10,7 @@ from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.datasets.deployments import draw_up_map
 from pipeline.datasets.trend import follow_trend
 from pipeline.report import lead_to
-from pipeline.report.map_page import write_map
-from pipeline.report.trend_page import write_trend
+from pipeline.report.datasets_page import write_map, write_trend
 from pipeline.store import Store, see_log
 
 
@@ -42,7 +41,7 @@ def test_every_page_links_those_that_are_there_and_all_that_came_since(tmp_path:
     write_map(store, draw_up_map(store))
     assert links_of(tmp_path / "index.html") == ["map.html"]
     assert links_of(tmp_path / "map.html") == ["index.html"]
-    write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
+    write_trend(store, follow_trend(store, ("dataset",)))
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
     assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
     assert links_of(tmp_path / "map.html") == ["index.html", "trend.html"]

@@ -39,7 +39,6 @@ PUBLIC = {
     "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"promises"},  # a key of plan.toml
     "pipeline/recording/roles.py": {"left"},  # a key of run.toml
-    "pipeline/report/map_page.py": {"left"},  # a value of a template
     "schemas/run_tables.py": {"rung"},  # a column
 }
 """Vocabulary of files, screens and libraries, which stays."""

@@ -54,12 +54,7 @@ READING = {
         ("model", "literature"),
         ("model", "literature", "icr_offset"),
     ],
-    "forecast.txt": [
-        ("fleet", "fit"),
-        ("fleet", "predict", "--vehicle", "husky_a200", "--terrain", "lab_floor"),
-        ("fleet", "predict", "--vehicle", "husky_a200", "--terrain", "ice"),
-        ("fleet", "predict", "--vehicle", "jackal", "--terrain", "ice"),
-    ],
+    "fleet_of_one.txt": [("fleet", "fit"), ("fleet", "show", "--all")],
     "effects.txt": [
         ("effects",),
         ("effects", "drive_lag"),
@@ -74,7 +69,6 @@ READING = {
         ("model", "add", "robot.toml", "drive_lag"),
         ("model", "export", "robot.toml"),
         ("fleet", "trend", "results", "other"),
-        ("fleet", "predict", "results", "--vehicle", "husky_a200", "--terrain", "ice"),
     ],
 }
 """Commands by the file that holds what they print, in the folder of the stored run, one after the other."""
@@ -93,9 +87,8 @@ SEASON = {
     "compare.txt": [("compare", "--by", "run"), ("compare",), ("compare", "--causes")],
     "fleet.txt": [
         ("fleet", "fit"),
-        ("fleet", "show"),
+        ("fleet", "show", "--all"),
         ("fleet", "trend"),
-        ("fleet", "trend", "--limit", "effective_track.k=2"),
         ("fleet", "map"),
     ],
 }

@@ -110,10 +110,8 @@ WORDS: list[tuple[str, str]] = [
     # Several runs
     ("check field/wide field/wide", "a run is on both sides: field/wide. Give"),
     ("check husky.toml nowhere.mcap", "nowhere.mcap"),
-    ("check nowhere.json field/wide", "the baseline cannot be read"),
     ("check husky.toml field/wide --limits nowhere.toml", "the limits cannot be read"),
     ("check field/wide husky.toml", "husky.toml: AFTER is a model file, and not what was driven"),
-    ("check field/wide robot.json", "robot.json: AFTER is a baseline, and not what was driven"),
     ("check '' field/wide", "the check has no runs BEFORE"),
     ("check husky.toml ''", "the check has no runs AFTER"),
     ("check husky.toml field/wide --file check.md", "Add --to markdown or --to junit"),
@@ -123,22 +121,10 @@ WORDS: list[tuple[str, str]] = [
     ("compare --vehicle warthogg", "no run is of warthogg"),
     ("compare nobody husky_a200_lab_floor", "no dataset is called nobody"),
     ("compare husky_a200_lab_floor husky_a200_lab_floor", "is one dataset"),
-    ("fleet trend --limit median_modulus=inf", "'median_modulus=inf' is not a limit"),
-    ("fleet trend --limit median_modulos=1", "is not a quantity.*Did you mean median_modulus"),
-    ("fleet trend --limit effective_track.q=1", r"Did you mean effective_track\.k"),
-    ("fleet trend --limit beauty=1", "There are median_modulus, "),
-    ("fleet trend --threshold inf", "inf is not a threshold"),
-    ("fleet show", "fleet fit"),
-    ("fleet predict --vehicle jackal --terrain ice", "no run of jackal"),
-    ("fleet map --cell 3", "Add --terrain"),
-    ("fleet map --terrain --cell .01", r"a cell of 0\.01 m is not possible"),
-    ("fleet map --terrain --figures svg", "--figures is of the map of deployments"),
-    ("fleet map merge missing.parquet text.mcap --file map.parquet", "missing.parquet"),
     *(
         (f"{verb} --results nowhere", "nowhere: there are no results: there is no such folder. Give")
         for verb in (
             "compare", "compare --causes", "fleet fit", "fleet show", "fleet trend", "fleet map",
-            "fleet share --file shared.parquet", "fleet predict --vehicle warthog --terrain ice",
             "results status", "results verify", "results query 'SELECT 1'", "batch --prune",
         )
     ),

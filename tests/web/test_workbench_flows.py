@@ -12,7 +12,7 @@ from workbench_server import ERROR, RUN, SHOWN, Workbench
 
 from pipeline.analysis.analyze import update_datasets
 from pipeline.datasets.deployments import draw_up_map
-from pipeline.report.map_page import write_map
+from pipeline.report.datasets_page import write_map
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

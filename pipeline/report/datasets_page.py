@@ -1,0 +1,394 @@
+"""The one page of what sets runs side by side: sentences, figures, tables, notes."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import polars as pl
+
+from pipeline.core import INPUT_WORDS, FigureFormat, format_count, format_csv
+from pipeline.datasets import (
+    ABOUT_UNIT,
+    AS_PUBLISHED,
+    EQUAL_DRIVING,
+    MEASURES,
+    QUANTITIES,
+    THIS_RUN,
+    Answer,
+    Budget,
+    Causes,
+    DeploymentMap,
+    Fleet,
+    Series,
+    Trend,
+)
+from pipeline.report import (
+    Cell,
+    Column,
+    Picture,
+    Table,
+    bracket_unit,
+    format_number,
+    label_names,
+    theme,
+    write_page,
+)
+from pipeline.report.page import add_figures, render_figures
+from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axis
+from pipeline.store import Store
+from pipeline.words import list_answer, list_shown_notes
+
+_ROW = 34
+_MOST_FIGURES = 40
+"""Series of a page: those with a step come first."""
+_SHOWN = (
+    "dataset", "runs", "samples", "distance", "duration", "median_modulus", "low", "high", "interval",
+    "equal_modulus",
+    "equal_low", "equal_high", "median_window_norm", "published_norm", "transitory_median_modulus",
+    "steady_median_modulus", "drivetrain_mean_square", "ground_mean_square", "height_rate",
+    "largest_kinetic_energy",
+    *(measure.column for measure in MEASURES.values() if measure.column != "median_modulus"),
+)  # fmt: skip
+_PAIRS = (
+    "a", "b", "ratio", "ratio_low", "ratio_high", "shift", "low", "high", "cliffs_delta", "size",
+    "p_adjusted", "p", "spread", "freedom", "overlap", "method", "note",
+)  # fmt: skip
+
+
+def tabulate_frame(caption: str, frame: pl.DataFrame, units: Mapping[str, str] | None = None) -> Table:
+    """A table of Polars as one of a page, without the columns that are empty.
+
+    Args:
+        caption: what it shows.
+        frame: the table; ``_`` in names of columns becomes a space.
+        units: units of columns.
+    """
+    columns = [
+        Column(name.replace("_", " "), (units or {}).get(name, ""), number=kind.is_numeric())
+        for name, kind in frame.schema.items()
+    ]
+    rows: list[list[str | Cell]] = [
+        [
+            format_number(value) if isinstance(value, float) else "" if value is None else str(value)
+            for value in row
+        ]
+        for row in frame.iter_rows()
+    ]
+    return Table(caption, columns, rows).drop_empty()
+
+
+def _write(
+    store: Store,
+    name: str,
+    title: str,
+    facts: Sequence[str],
+    *,
+    pictures: Sequence[Picture],
+    tables: Sequence[Table],
+    lines: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    runs: Sequence[str] = (),
+    figures: FigureFormat | None = None,
+) -> dict[str, Path]:
+    """Write a page where figures can be drawn, and its figures if a format is given; the files by name."""
+    written: dict[str, Path] = {}
+    if theme.can_draw() or not pictures:
+        page = render_figures(
+            "report/templates/datasets.html", pictures, title=title, facts=facts, lines=lines,
+            tables=[one for one in tables if one.rows], notes=notes, runs=runs,
+        )  # fmt: skip
+        written[name] = write_page(store, name, page)
+    return written | add_figures(store, lambda: pictures, figures)
+
+
+def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:
+    """Write `datasets`, `comparisons` and `features`, the first two also as CSV, and `comparison.html`.
+
+    Args:
+        store: the results.
+        answer: result of `compare_results`.
+        figures: also write the figures to `figures/` in this format.
+
+    Returns:
+        The files by name.
+
+    Raises:
+        SlipError: figures were asked for, and what draws them is not installed.
+    """
+    written: dict[str, Path] = {}
+    for name, frame in (("datasets", answer.datasets), ("comparisons", answer.comparisons)):
+        store.write_results_table(name, frame)
+        written[f"{name}.csv"] = store.write_results_text(f"{name}.csv", format_csv(frame, digits=6))
+    store.write_results_table("features", answer.features)
+    main = answer.datasets.filter(pl.col("input").cast(pl.String) == answer.input)
+    published = answer.views[0][1] == AS_PUBLISHED
+    tables = [
+        tabulate_frame(f"Datasets, slip {INPUT_WORDS[answer.input]}; medians over runs", main.select(_SHOWN))
+    ]
+    for source, quantity in answer.views:
+        pairs = answer.take(answer.comparisons, (source, quantity)).sort(
+            "p_adjusted", "a", "b", nulls_last=True
+        )
+        tables.append(
+            tabulate_frame(f"Pairs {QUANTITIES[quantity]}, {INPUT_WORDS[source]}", pairs.select(_PAIRS))
+        )
+    return written | _write(
+        store,
+        "comparison.html",
+        "Deployments compared",
+        [f"{main.height} datasets", f"{main['runs'].sum()} runs", answer.measure],
+        lines=[f"{title}, {about}: {text}" for title, about, text in list_answer(answer)],
+        pictures=[picture for view in answer.views if (picture := _draw_levels(answer, view))],
+        tables=tables,
+        notes=[*list_shown_notes(answer), *([ABOUT_UNIT] if published else [])],
+        runs=[f"{row['dataset']}: {row['keys']}" for row in main.iter_rows(named=True)],
+        figures=figures,
+    )
+
+
+def _draw_levels(answer: Answer, view: tuple[str, str]) -> Picture | None:
+    """Value of every run as a point, and of its dataset with its interval."""
+    source, quantity = view
+    levels = answer.take(answer.levels, view).sort("value", "dataset")
+    if levels.is_empty():
+        return None
+    labels = label_names(levels["dataset"].to_list())
+    runs = answer.runs.filter(pl.col("input").cast(pl.String) == source, pl.col(quantity).is_not_null())
+    points = runs.filter(pl.col("group").is_in(list(labels))).select(
+        pl.col("group").replace_strict(labels, return_dtype=pl.String).alias("label"),
+        "run",
+        pl.col(quantity).alias("value"),
+    )
+    # Intervals of so few runs that they tell little of others would flatten the points.
+    end = 1.6 * float(points["value"].to_numpy().max())
+    kinds = ["95 % interval over runs", "of this run only"]
+    spans = levels.select(
+        pl.col("dataset").replace_strict(labels, return_dtype=pl.String).alias("label"),
+        "value",
+        pl.col("low").clip(0.0, end),
+        pl.col("high").clip(0.0, end),
+        pl.when(pl.col("interval") == THIS_RUN)
+        .then(pl.lit(kinds[1]))
+        .otherwise(pl.lit(kinds[0]))
+        .alias("kind"),
+    )
+    name, words = f"{quantity}_{source}", INPUT_WORDS[source]
+    title = f"{'slip modulus' if quantity == EQUAL_DRIVING else answer.measure} {words} [m/s]"
+    order = list(labels.values())
+    axis = {"title": None, "labelLimit": 280, "minExtent": 190, "grid": False, "labelColor": theme.INK}
+    rows = encode_column("label:N", sort=order, axis=axis, scale={"domain": order})
+    colours = {"domain": kinds, "range": [theme.ON_COMMAND, theme.CROSS]}
+    bars = (
+        Chart.of_rows(f"{name}_spans")
+        .mark("rule", strokeWidth=5, opacity=0.75)
+        .encode(
+            y=rows,
+            x=make_axis("low", title, scale={"domain": [0.0, end], "nice": True}, tickCount=5),
+            x2="high:Q",
+            color=encode_column("kind:N", scale=colours, legend={"title": None, "symbolType": "stroke"}),
+        )
+    )
+    middles = (
+        Chart.of_rows(f"{name}_spans")
+        .mark("tick", size=18, thickness=2.5, color=theme.MEASURED)
+        .encode(y=rows, x="value:Q")
+    )
+    dots = (
+        Chart.of_rows(f"{name}_runs")
+        .mark("point", size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
+        .encode(y=rows, x="value:Q", tooltip=["run:N", encode_column("value:Q", format=".3")])
+    )
+    chart = layer(bars, dots, middles).properties(
+        width=640, height=_ROW * len(order), usermeta={"gutter": 210}
+    )
+    text = ", ".join(
+        f"{dataset} {value:.3g}" for dataset, value in levels.select("dataset", "value").iter_rows()
+    )
+    note = "Compare within a vehicle only: the vehicles drove differently." * (len(answer.families) > 1)
+    drawing = Drawing(chart, {f"{name}_spans": spans, f"{name}_runs": points}, note, f"In m/s: {text}.")
+    return Picture(name, f"Slip {QUANTITIES[quantity]}, {words}", drawing, width="half")
+
+
+def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = None) -> dict[str, Path]:
+    """Write `causes.csv`, `cause_differences.csv` and `causes.html`; the files by name."""
+    budgets, differences = (causes.tabulate(differences=one) for one in (False, True))
+    written = {
+        name: store.write_results_text(name, format_csv(frame, digits=6))
+        for name, frame in (("causes.csv", budgets), ("cause_differences.csv", differences))
+    }
+    caption = "Differences of RMS slip by cause; p over the causes of a pair"
+    return written | _write(
+        store,
+        "causes.html",
+        "Deployments compared by cause",
+        [format_count(len(causes.budgets), "dataset"), f"slip {INPUT_WORDS[causes.input]}"],
+        lines=[one.describe(causes.names) for one in causes.differences],
+        pictures=[_draw_causes(causes.budgets, causes.names)],
+        tables=[
+            tabulate_frame("Budgets: shares of the mean square slip, means over runs", budgets),
+            tabulate_frame(caption, differences, {"difference": "m/s"}),
+        ],
+        notes=causes.notes,
+        runs=causes.keys,
+        figures=figures,
+    )
+
+
+def _draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
+    """A bar per dataset with the length of its RMS slip, split into causes."""
+    labels = label_names([budget.dataset for budget in budgets])
+    parts = [
+        (labels[one.dataset], names.get(part.name, part.name), math.sqrt(one.total) * part.value)
+        for one in budgets
+        for part in one.parts
+    ]
+    kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64}
+    rows = pl.DataFrame(parts, schema=kinds, orient="row")
+    chart = (
+        Chart.of_rows("causes")
+        .mark("bar")
+        .encode(
+            y=encode_column("dataset:N", sort=list(labels.values()), axis={"title": None, "grid": False}),
+            x=encode_column(
+                "sum(slip):Q", axis={"title": "RMS slip over half a second [m/s]", "format": ",~r"}
+            ),
+            color=encode_column(
+                "cause:N", legend={"title": None, "columns": 3}, scale={"scheme": "tableau20"}
+            ),
+            tooltip=["dataset:N", "cause:N", encode_column("slip:Q", format=".3")],
+        )
+        .properties(width=640, height={"step": 30}, usermeta={"gutter": 150})
+    )
+    text = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
+    note = "A negative part increases the held-out slip of the model."
+    drawing = Drawing(chart, {"causes": rows}, note, f"RMS slip: {text}.")
+    return Picture("causes", "RMS slip of each dataset by cause", drawing)
+
+
+def write_fleet(store: Store, fleet: Fleet) -> dict[str, Path]:
+    """Write the table `fleet` and `fleet.html`; the files by name."""
+    table = fleet.tabulate()
+    store.write_results_table("fleet", table)
+    columns = (
+        "effect", "parameter", "terrain", "level", "value", "low", "high", "another_low", "another_high",
+        "unit",
+        "spread_terrain", "spread_run", "runs", "named", "name", "because",
+    )  # fmt: skip
+    tables = [
+        tabulate_frame(f"{vehicle}: levels, and what to expect of another run", rows.select(columns))
+        for (vehicle,), rows in table.partition_by("vehicle", as_dict=True, maintain_order=True).items()
+    ]
+    facts = [format_count(len(fleet.runs), "vehicle"), format_count(len(fleet.keys), "run")]
+    lines = [fleet.summary.rstrip(".")]
+    title = "Parameters by level: vehicle, terrain, run"
+    return {"fleet.parquet": store.root / "fleet.parquet"} | _write(
+        store,
+        "fleet.html",
+        title,
+        facts,
+        lines=lines,
+        pictures=[],
+        tables=tables,
+        notes=fleet.notes,
+        runs=fleet.keys,
+    )
+
+
+def write_trend(store: Store, trend: Trend) -> dict[str, Path]:
+    """Write `trend.html`; the files by name."""
+    shown = [one for one in trend.series if one.points.height > 1][:_MOST_FIGURES]
+    rows = [(one.group, one.quantity, one.points.height, one.describe()) for one in trend.series]
+    table = pl.DataFrame(rows, schema=["group", "quantity", "runs", "result"], orient="row")
+    return _write(
+        store,
+        "trend.html",
+        "Trends",
+        [f"{len(trend.series)} series", format_count(len(trend.keys), "run")],
+        lines=[f"{one.quantity} of {one.group}: {one.describe()}" for one in trend.series if one.is_changed],
+        pictures=[_draw_series(one, f"trend_{number}") for number, one in enumerate(shown)],
+        tables=[tabulate_frame("All series", table)],
+        notes=trend.notes,
+        runs=trend.keys,
+    )
+
+
+def _draw_series(series: Series, name: str) -> Picture:
+    rows = series.points.with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
+    about = f"runs in the order of their dates, {rows['day'][0]} to {rows['day'][-1]}"
+    dots = (
+        Chart.of_rows(name)
+        .mark("point", size=46, filled=True, color=theme.SLIP, opacity=0.9)
+        .encode(
+            x=encode_column("order:Q", axis={"title": about, "labels": False, "grid": False}),
+            y=encode_column("value:Q", axis={"title": None, "format": ",.3~r"}, scale={"zero": False}),
+            shape=encode_column("terrain:N", legend={"title": None}),
+            tooltip=["run:N", "day:N", "terrain:N", encode_column("value:Q", format=".4")],
+        )
+    )
+    charts = [dots]
+    if series.is_changed and series.step is not None:
+        first = rows["run"].to_list().index(series.step.run) - 0.5
+        rows = rows.with_columns(pl.lit(first).alias("step"))
+        charts.append(Chart.of_rows(name).mark("rule", color=theme.ON_COMMAND).encode(x="step:Q"))
+    chart = layer(*charts).properties(width=640, height=130, usermeta={"gutter": 60})
+    text = series.describe()
+    title = f"{series.quantity} of {series.group}{bracket_unit(series.unit)}"
+    return Picture(name, title, Drawing(chart, {name: rows}, text[:1].upper() + text[1:], text), width="half")
+
+
+def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> dict[str, Path]:
+    """Write `map.html`, and its figure if a format is given; the files by name."""
+    about = f"{drawn.measure.name} {INPUT_WORDS[drawn.input]}{bracket_unit(drawn.measure.unit)}"
+    units = {"energy": "J", drawn.measure.name.replace(" ", "_"): drawn.measure.unit}
+    named = drawn.own.rename({"value": drawn.measure.name.replace(" ", "_")})
+    missing = f"not on the map, as mass, speed or terrain is not published: {', '.join(drawn.missing)}"
+    return _write(
+        store,
+        "map.html",
+        "Deployment map",
+        [f"{drawn.points.height} deployments", f"{drawn.own.height} own datasets"],
+        pictures=[_draw_map(drawn, about)],
+        tables=[
+            tabulate_frame(f"Own datasets: largest kinetic energy of a run, {about}", named, units),
+            tabulate_frame("The literature", drawn.points, units),
+        ],
+        notes=[*drawn.notes, *([missing] if drawn.missing else [])],
+        runs=drawn.keys,
+        figures=figures,
+    )
+
+
+def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
+    """Kinetic energy against terrain complexity, own datasets as large points."""
+    axes = {
+        "x": make_axis(
+            "complexity", "terrain complexity (0 flat asphalt, 10 impassable)", (0.0, 10.0), tickCount=10
+        ),
+        "y": make_axis("energy", "largest kinetic energy [J]", scale={"type": "log"}, format="~s"),
+    }
+    literature = (
+        Chart.of_rows("literature")
+        .mark("point", size=70, strokeWidth=1.4, opacity=1, stroke=theme.MEASURED)
+        .encode(
+            **axes,
+            fill={"condition": {"test": "datum.sure", "value": theme.CROSS}, "value": theme.PAPER},
+            tooltip=["key:N", "vehicle:N", "terrain:N", "energy:Q", "bound:N"],
+        )
+    )
+    marks = (
+        Chart.of_rows("own")
+        .mark("point", size=170, filled=True, opacity=1)
+        .encode(
+            **axes,
+            color=encode_column("value:Q", scale={"range": list(theme.SLIP_RAMP)}, legend={"title": about}),
+            tooltip=["dataset:N", "runs:Q", "energy:Q", "value:Q"],
+        )
+    )
+    names = Chart.of_rows("own").mark("text", align="left", dx=12, fontWeight=600).encode(
+        **axes, text="dataset:N"
+    )  # fmt: skip
+    chart = layer(literature, marks, names).properties(width=720, height=520)
+    note = "Hollow: mass, speed or terrain is not known well. Point at a mark to read what it is."
+    words = f"{drawn.points.height} deployments of the literature and {drawn.own.height} own datasets."
+    rows = {"literature": drawn.points, "own": drawn.own}
+    return Picture("deployment_map", "Energy and terrain", Drawing(chart, rows, note, words))
