@@ -129,7 +129,7 @@ def compare_processes(logs: Path, work: Path, count: int, rounds: int) -> None:
             runs[jobs].append(run_batch(season, work / "compared", jobs))
     print(f"\n{count} logs on one and two processes, best of {rounds}")
     print("           clock  alone:        leader  workers'      workers'")
-    print("processes  [s]    begin + end   cpu [s] s/log [ms]    memory [MB]")
+    print("processes  [s]    begin + end   cpu [s] per log [ms] memory [MB]")
     best = {jobs: min(some, key=lambda run: run.seconds) for jobs, some in runs.items()}
     for jobs, run in best.items():
         print(
