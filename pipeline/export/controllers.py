@@ -7,7 +7,8 @@ import operator
 import re
 from collections.abc import Callable
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from pipeline.core import make_plain
 from pipeline.export import (
@@ -303,8 +304,8 @@ def read_vesc(text: str) -> Current:
     """
     try:
         # Scalars as texts: the constructors of other types fail in ways of their own.
-        tree = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - the loader that makes texts only
-    except (yaml.YAMLError, RecursionError) as error:
+        tree = YAML(typ="base", pure=True).load(text)
+    except (YAMLError, RecursionError) as error:
         what = f"is not YAML: {' '.join(str(error).split())}"
         hint = "Give the vesc.yaml that the car was driven with."
         raise MotionError("parameters_unreadable", what, where="--current", hint=hint) from None
