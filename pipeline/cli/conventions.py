@@ -31,7 +31,6 @@ CLEAN = 0
 FAILED = 1
 USAGE = 2
 LOSSY = 3
-ALERT = 4
 
 _DOING = {**STAGE_WORDS, "diagnosis": "estimating effects"}
 

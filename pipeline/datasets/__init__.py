@@ -10,7 +10,7 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.datasets.causes import Budget, Causes, find_causes
-    from pipeline.datasets.check import BROKEN, Check, Number, check_runs, read_limits
+    from pipeline.datasets.check import Check, Number, check_runs, read_limits
     from pipeline.datasets.compare import (
         ABOUT_UNIT,
         AS_PUBLISHED,
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     )
     from pipeline.datasets.compared_runs import NOT_VALID, Question, find_material
     from pipeline.datasets.deployments import DeploymentMap, draw_up_map
-    from pipeline.datasets.fleet import Band, Expected, Fleet, FleetNumber, expect_run, fit_results
+    from pipeline.datasets.fleet import Band, Expected, Fleet, expect_run, fit_results
     from pipeline.datasets.pairs import ALIKE, DIFFERENT, OF_TWO_RUNS, THIS_RUN, UNTESTED, judge_pair
     from pipeline.datasets.pooling import MEASURES, ComparisonError, gather_runs, pool_runs
     from pipeline.datasets.stored_fits import ModelFit, contest_models, fit_to_runs, read_runs

@@ -275,11 +275,6 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     return ""
 
 
-def can_read(manifest: Manifest, table: str) -> bool:
-    """Whether a run has a table, whole and of the present contract version."""
-    return not _doubt(manifest, (table,)) and manifest.find_damage([table]) is None
-
-
 def _explain_empty(manifest: Manifest) -> str:
     """Reason why a diagnosis gave no numbers."""
     try:

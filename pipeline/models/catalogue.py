@@ -71,13 +71,8 @@ def name_effect(effect: str) -> str:
     return find_words(effect).name or effect.replace("_", " ").capitalize()
 
 
-def name_parameter(effect: str, parameter: str) -> str:
-    """Name of a parameter in words: that of its effect, with what it is if that has several."""
-    return f"{name_effect(effect)}{_name_among(effect, parameter)}"
-
-
 def name_number(effect: str, parameter: str) -> str:
-    """As `name_parameter`, within a sentence: `wheel servo: time constant straight ahead`."""
+    """Name of a parameter within a sentence: `wheel servo: time constant straight ahead`."""
     return f"{name_term(effect)}{_name_among(effect, parameter)}"
 
 

@@ -34,14 +34,11 @@ if TYPE_CHECKING:
         name_damage,
         no_results,
         path_unread,
-        read_day,
     )
     from pipeline.store.parquet_tables import (
         CheckedTable,
         check_size,
         check_table,
-        encode_parquet,
-        list_complaints,
     )
     from pipeline.store.results_folder import RUNS, Store, scan_table
     from pipeline.store.stored_files import SUMMARY, convert_stored, decode_stored, read_stored
