@@ -2,7 +2,7 @@
 
 Runs are the unit. The mean square slip of a deployment is the mean over its runs, per cause; the difference
 of two is the sum of the differences per cause. The difference of two roots is that of their squares over the
-sum of the roots, so that differences of RMS slip add up over causes as well.
+sum of the roots, so that they add up over causes as well.
 """
 
 import itertools

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 TABLES = {"polars", "pyarrow", "dataframely"}
-ALWAYS = {"altair", "rosbags", "starlette", "mcap_protobuf"}
+ALWAYS = {"altair", "starlette", "mcap_protobuf"}
 """What neither help nor reading, the stages or the report has a use for."""
 
 CODE = """

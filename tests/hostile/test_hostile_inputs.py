@@ -251,7 +251,7 @@ LIMITS = [
 
 GAINS = [
     ("vesc", "a: [", "is not YAML"),
-    ("vesc", "a: &a {b: *a, c: [*a]}", "params"),
+    ("vesc", "a: &a {b: *a, c: [*a]}", "vesc.yaml"),
     ("vesc", "{a: " * 3000, "params"),
     ("vesc", "\x00", "params"),
     ("px4", "1 1 NAME\n", "vehicle, component, name"),

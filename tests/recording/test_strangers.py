@@ -348,21 +348,6 @@ def test_of_a_joystick_no_gain_is_told(tmp_path: Path) -> None:
     assert "have no sure unit" in told(setup)
 
 
-def test_a_version_of_a_type_without_its_currents_is_read_all_the_same(tmp_path: Path) -> None:
-    robot = Robot()
-    definition = "float64 linear_velocity\nfloat64 angular_velocity\nfloat64 battery_voltage\n"
-    drives = replace(robot.does, speed=RADIUS * robot.wheels.mean(axis=1))
-    fields = {
-        "linear_velocity": drives.speed,
-        "angular_velocity": drives.turn,
-        "battery_voltage": drives.turn,
-    }
-    status = record_cdr(drives, "/scout_status", "scout_msgs/msg/ScoutStatus", fields, definition)
-    setup = set_up(tmp_path, robot.command(), status, robot.pose())
-    assert str(setup.sources.wheels).startswith("/scout_status")
-    assert setup.sources.power is None
-
-
 def test_the_radius_of_the_wheels_of_an_unknown_car_is_no_scale_of_its_commands(tmp_path: Path) -> None:
     """Its wheels were said to turn 3.34 times as fast as commanded, and to a drive gain of .3."""
     drive, radius, wheelbase = draw(31), 0.3, 2.5
