@@ -12,20 +12,29 @@ import msgspec
 import numpy as np
 from mcap_ros2.writer import Writer
 
-from pipeline.core import Floats, TomlError, format_share, group_by, parse_toml, read_bounded_text
-from pipeline.estimation.terms import SUGGESTION
+from pipeline.core import (
+    Floats,
+    TomlError,
+    format_digits,
+    format_share,
+    group_by,
+    parse_toml,
+    read_bounded_text,
+    suffix_unit,
+)
+from pipeline.logs import LogError, locate_recorded, open_log
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
-from pipeline.plan.manoeuvres import LONGEST_S, RATE_HZ, PlanError
-from pipeline.plan.plan import SAFETY, ExpectedGain, Plan
+from pipeline.plan.manoeuvres import LONGEST_S, RATE_HZ, PlanError, is_steered
+from pipeline.plan.plan import SAFETY, Plan, Question
 from pipeline.results import RunDiagnosis
 from pipeline.run import DriveSeries, MotionRun, name_inputs
 from pipeline.sources import Vehicle
-from pipeline.store import TEMPORARY, replace_file
+from pipeline.store import TEMPORARY, Manifest, read_choices, replace_file
 from pipeline.words import describe_separation, suggest_drive
 
 PAGE = "plan.html"
-_CHECKED = ("question", "effects", "kind", "goal", "now", "expected", "decided_after_s", "drives")
+_CHECKED = ("question", "effects", "kind", "goal", "now", "unit", "expected")
 """What a file says of a question, which `slip plan --check` compares with the drive."""
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
 FILES = (*_NAMES, PAGE)
@@ -44,6 +53,54 @@ _START_NS = 1_700_000_000_000_000_000
 _SECOND = 1_000_000_000
 
 
+def read_command(manifest: Manifest) -> dict[str, object]:
+    """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
+    configuration = manifest.details.get("configuration")
+    source = configuration.get("command") if isinstance(configuration, dict) else None
+    return {**read_choices(manifest), "command_source": source}
+
+
+def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> tuple[str, str]:
+    """Topics and type of the command in a log; the vehicle's usual one if the log has none.
+
+    A body command has priority over a pair of wheel speeds [rad/s].
+    """
+    types = list_types(steered=is_steered(vehicle))
+    chosen = choices.get("choices")
+    command = chosen.get("command") if isinstance(chosen, dict) else None
+    asked: list[str] = []
+    if isinstance(command, dict):
+        asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]
+    message_types = _read_types(log) if asked else {}
+    for topic in asked:
+        if message_types.get(topic) in types:
+            return topic, message_types[topic]
+    if isinstance(command, dict) and command.get("type") == WHEELS and _is_plain(choices, vehicle):
+        sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
+        if len(sides) == 2:  # noqa: PLR2004 - left and right
+            return ", ".join(sides), WHEELS
+    # The topic of a single motor does not accept body commands.
+    usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
+    return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
+
+
+def _read_types(log: str) -> Mapping[str, str]:
+    """Message types by topic of a stored run's log; empty if the log is missing or not accessible."""
+    try:
+        location = locate_recorded(log)
+    except LogError:
+        return {}
+    return open_log(location).types if location.exists() else {}
+
+
+def _is_plain(choices: Mapping[str, object], vehicle: Vehicle) -> bool:
+    """Whether recorded wheel commands are in rad/s, positive forward."""
+    asked = choices.get("command_source")
+    source = asked if isinstance(asked, dict) else {}
+    unit, sign = source.get("unit"), source.get("sign")
+    return not vehicle.units and unit in {None, "rad/s"} and sign in {None, 1} and not source.get("per_turn")
+
+
 def list_types(*, steered: bool) -> tuple[str, ...]:
     """Message types of body commands with a steering angle, or with a yaw rate."""
     return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
@@ -55,12 +112,12 @@ class StoredPlan(msgspec.Struct, frozen=True):
     Attributes:
         vehicle: id of the vehicle.
         runs: names of the runs that the plan is based on.
-        promises: expected gains by question, for the drive alone.
+        promises: what is expected by question.
     """
 
     vehicle: str
     runs: list[str] = []
-    promises: list[ExpectedGain] = []
+    promises: list[Question] = []
 
 
 def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
@@ -166,8 +223,6 @@ def _format_csv(plan: Plan) -> str:
 
 
 def _format_toml(plan: Plan) -> str:
-    turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
-    faster = "max_steering_rate_radps" if plan.steered else "max_yaw_acceleration_radps2"
     lines = ["# What to drive next. `slip plan --check` compares the drive with these expectations."]
     lines += [f"# {line}" for line in SAFETY]
     lines += _format_table(
@@ -180,24 +235,14 @@ def _format_toml(plan: Plan) -> str:
             "duration_s": plan.commands.duration_s,
         }
     )
-    lines += ["", "[limits]"]
-    lines += _format_table(
-        {
-            "max_speed_mps": plan.limits.speed_mps,
-            turn: plan.limits.turn,
-            "max_acceleration_mps2": plan.limits.acceleration_mps2,
-            faster: plan.limits.turn_rate,
-            "max_lateral_acceleration_mps2": plan.limits.lateral_mps2,
-        }
-    )
+    limits = {name: value for name, value in asdict(plan.limits).items() if math.isfinite(value)}
+    lines += ["", "[limits]", *_format_table(limits)]
     lines += ["", "# The start is the middle; the first side lies along the heading at the start.", "[area]"]
     lines += _format_table({**asdict(plan.area), "home_m": plan.home_m})
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
-    for one in plan.informative:
-        # Another diagnosis may suggest another term: what is said of it cannot be checked.
-        if math.isfinite(one.decided_after_s) and SUGGESTION not in one.effects:
-            lines += ["", "[[promises]]", *_format_table({name: getattr(one, name) for name in _CHECKED})]
+    for one in plan.promises:
+        lines += ["", "[[promises]]", *_format_table({name: getattr(one, name) for name in _CHECKED})]
     return "\n".join(lines) + "\n"
 
 
@@ -206,84 +251,51 @@ def _format_table(table: Mapping[str, object]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class CheckedAnswer:
-    """An expected gain and its outcome.
+class Check:
+    """Outcomes of a plan.
 
     Attributes:
-        question: as text.
-        expected: as text.
-        measured: as text.
-        is_met: whether the outcome is as expected.
+        kept: ``question``, ``promised`` and ``measured`` as text, and ``kept``, for each promise.
+        open: what remains open, with what would decide it, as text.
     """
 
-    question: str
-    expected: str
-    measured: str
-    is_met: bool
-
-
-@dataclass(frozen=True)
-class Check:
-    """All expected gains with their outcomes, and the questions that remain open, as text."""
-
-    answers: tuple[CheckedAnswer, ...]
+    kept: tuple[dict[str, str | bool], ...]
     open: tuple[str, ...]
-
-    def to_json(self) -> dict[str, object]:
-        """The documented keys of `slip plan --check --json`."""
-        rows = [
-            {"question": one.question, "promised": one.expected, "measured": one.measured, "kept": one.is_met}
-            for one in self.answers
-        ]
-        return {"kept": rows, "open": list(self.open)}
 
 
 def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
-    """Compare expected gains with the joint diagnosis of the earlier logs and those of the plan.
+    """Compare what a plan promised with the joint diagnosis of the earlier logs and those of the plan.
 
-    A separation is fulfilled if no ambiguous group contains all of its effects any more and one of them is
-    identified, or all are observable and none acts; an interval if it is as narrow as expected.
+    An interval is kept if it is as narrow as promised. What else was open is decided if one of the effects is
+    identified and no ambiguous group contains all of them, or if all are observable and none acts.
     """
-    answers = tuple(
-        _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
-        for one in plan.promises
-    )
+    values = {
+        f"{effect.id}.{name}": value
+        for effect in diagnosis.effects
+        for name, value in effect.parameters.items()
+    }
+    kept: list[dict[str, str | bool]] = []
+    for one in plan.promises:
+        promised, asked = f"t = {one.expected:.1f}", set(one.effects)
+        if one.kind == "interval":
+            promised = f"±{format_digits(one.expected)}{suffix_unit(one.unit)}"
+            value = values.get(one.question.partition(" ")[0])
+            measured = "not found" if value is None else f"{value.value:.3g} ±{format_digits(value.half)}"
+            is_kept = value is not None and value.half <= one.expected
+        else:
+            named = [effect.id for effect in diagnosis.effects if effect.id in asked]
+            is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
+            # What is identified explains the motion, which excludes its rival.
+            is_kept = not is_ambiguous and bool(named or not asked & diagnosis.unobservable_why.keys())
+            # With more data what two effects share may vanish: that is a decision, too.
+            measured = (" and ".join(named) or "decided: no effect") if is_kept else "still open"
+        kept.append({"question": one.question, "promised": promised, "measured": measured, "kept": is_kept})
     still = [
         f"{' or '.join(group.candidates)}: {describe_separation(group)}" for group in diagnosis.undecided
     ]
     hidden = group_by((suggest_drive(name), name) for name in diagnosis.unobservable_why)
     still += [f"{', '.join(names)}: {advice}" for advice, names in hidden.items()]
-    return Check(answers, tuple(still))
-
-
-def _check_separation(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
-    text = f"decided after {answer.decided_after_s:g} s (t = {answer.expected:.1f})"
-    named = [effect.id for effect in diagnosis.effects if effect.id in answer.effects]
-    asked = set(answer.effects)
-    is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
-    if named and not is_ambiguous:
-        # The identified effect explains the motion, which excludes its rival.
-        return CheckedAnswer(answer.question, text, " and ".join(named), is_met=True)
-    if is_ambiguous or asked & diagnosis.unobservable_why.keys():
-        return CheckedAnswer(answer.question, text, "still open", is_met=False)
-    # With more data the shared part of two effects may vanish: that is a decision, too.
-    return CheckedAnswer(answer.question, text, "decided: no effect", is_met=True)
-
-
-def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
-    text = f"±{answer.goal:.2g} after {answer.decided_after_s:g} s"
-    label = answer.question.partition(" ")[0]
-    for effect in diagnosis.effects:
-        for name, value in effect.parameters.items():
-            if f"{effect.id}.{name}" == label:
-                half = value.half
-                return CheckedAnswer(
-                    answer.question,
-                    text,
-                    f"{value.value:.3g} ±{half:.2g}",
-                    is_met=half <= answer.goal,
-                )
-    return CheckedAnswer(answer.question, text, "not found", is_met=False)
+    return Check(tuple(kept), tuple(still))
 
 
 _ALIKE = 0.6
