@@ -101,7 +101,9 @@ def choose_limits(
     Args:
         vehicle: with its preset's limits, which are never exceeded.
         driven: largest commands of the runs so far; None without a run.
-        speed_mps, yaw_rate_radps, acceleration_mps2: requested limits.
+        speed_mps: requested limit.
+        yaw_rate_radps: requested limit.
+        acceleration_mps2: requested limit.
 
     Raises:
         PlanError: ``no_limits``, the largest speed of the vehicle is not known.
@@ -225,7 +227,7 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits, scale: float = 1.0) -> dic
     low, high = _SLALOM_HZ
     swing = turn * np.sin(2.0 * np.pi * (low * time + 0.5 * (high - low) * time**2 / _SLALOM_S))
     slalom = _limit(np.full(time.size, 0.7 * speed), swing, vehicle, limits)
-    radii = [[(0.7 * speed, side * share * turn, 2.5) for share in (0.25, 0.5, 1.0)] for side in (1.0, -1.0)]
+    radii = [[(0.7 * speed, side * share * turn, 2.0) for share in (0.25, 0.5, 1.0)] for side in (1.0, -1.0)]
     slow = [(share * speed, 0.0, 1.0) for share in (0.05, 0.1, 0.2)]
     slow += [(0.2 * speed if steered else 0.0, share * turn, 1.0) for share in (0.1, 0.2)]
     made = {

@@ -47,7 +47,7 @@ from pipeline.run import Alignment
 from pipeline.words import suggest_drive
 
 DECIDED_T = 5.0
-"""Expected t of what a drive decides: the diagnosis decides at 1.6, and t scatters by one from drive to drive."""
+"""Expected t of what a drive decides: the diagnosis decides at 1.6, and t scatters by one between drives."""
 LEAD_S = 3.0
 """Zero commands before the first motion [s]."""
 _TAIL_S = 1.0
@@ -79,7 +79,8 @@ class Question:
         now: half-width so far; 0 for a t.
         unit, value: of the number of an interval.
         rows: for each thing that is to be known, its row in the information, last, and of what is not known.
-        expected: t, or half-width that 19 of 20 drives reach, of the runs and the drive together.
+        expected: t of the drive, or half-width of the runs and the drive together.
+        at_most: half-width that 19 of 20 drives reach: the spread of few blocks scatters.
         decided_after_s: time in the drive from which it is decided; infinite if it is not.
         needs: what would decide it where this drive adds nothing.
     """
@@ -93,6 +94,7 @@ class Question:
     value: float = math.nan
     rows: tuple[tuple[int, ...], ...] = field(default=(), repr=False)
     expected: float = math.nan
+    at_most: float = math.nan
     decided_after_s: float = math.inf
     needs: str = ""
 
@@ -148,13 +150,18 @@ class Plan:
         return tuple(one for one in self.questions if one.informs)
 
     @property
+    def decided(self) -> tuple[Question, ...]:
+        """Questions that the drive decides."""
+        return tuple(one for one in self.questions if math.isfinite(one.decided_after_s))
+
+    @property
     def home_m(self) -> float:
         """Largest distance of any model's end from the start."""
         return float(np.abs(self.ways[:, -1]).max())
 
     def summarize(self) -> str:
         """What the drive decides of all that is open."""
-        decided = [one for one in self.promises if math.isfinite(one.decided_after_s)]
+        decided = self.decided
         parts = [f"decides {len(decided)} of {len(self.questions)} open questions"]
         if decided:
             parts[0] += f" in {format_duration(self.commands.duration_s)}: " + name_first(
@@ -168,19 +175,19 @@ class Plan:
         """The open questions: those that the drive decides, in their order, then the others."""
         rows = []
         for one in self.promises:
-            after = f" after {format_duration(one.decided_after_s)}"
-            after = after if math.isfinite(one.decided_after_s) else ""
-            if one.kind == "interval":
+            is_decided = math.isfinite(one.decided_after_s)
+            after = f"after {format_duration(one.decided_after_s)}" if is_decided else ""
+            if one.kind == "separation":
+                rows.append((one.name, "undecided", f"decided {after}"))
+            elif one.kind == "interval":
                 unit = suffix_unit(one.unit)
-                now = f"{one.value:.3g} ±{format_digits(one.now)}{unit}"
-                after = f"±{format_digits(one.expected)}{unit}" + (
-                    after and f"; ±{format_digits(one.goal)}{after}"
-                )
-            elif one.kind == "presence":
-                now, after = "not seen", f"seen{after}, if it acts"
-            else:
-                now, after = "undecided", f"decided{after}"
-            rows.append((one.name, now, after))
+                told = f"±{format_digits(one.expected)}{unit}"
+                told += f"; ±{format_digits(one.goal)} {after}" if after else ""
+                rows.append((one.name, f"{one.value:.3g} ±{format_digits(one.now)}{unit}", told))
+        seen = [one for one in self.promises if one.kind == "presence"]
+        if seen:
+            after = f"seen after {format_duration(seen[-1].decided_after_s)}, if acting"
+            rows.append((name_first([one.name for one in seen]), "not seen", after))
         rest = [one for one in self.questions if not one.informs]
         for needs in dict.fromkeys(one.needs for one in rest):
             names = name_first(dict.fromkeys(one.name for one in rest if one.needs == needs))
@@ -229,8 +236,8 @@ class Assessment:
         self.prior, self._blocks, self._owner = prior, blocks, owner
         self._before = before_s / _BLOCK_S
 
-    def expect(self, one: Question, counts: Floats) -> tuple[float, float]:
-        """Expected t or half-width, and the share of the goal that is reached, 1 where it is decided.
+    def expect(self, one: Question, counts: Floats) -> tuple[Question, float]:
+        """A question with what is expected, and the share of its goal that is reached, 1 if it is decided.
 
         Args:
             one: the question.
@@ -242,15 +249,16 @@ class Assessment:
         carrying = self._count_blocks(number, weight)
         if one.kind != "interval":
             t = 0.5 * math.sqrt(max(strength - known, 0.0))
-            return t, min((t / one.goal) ** 2, 1.0) * min(carrying / FEWEST_OF_SPREAD, 1.0)
-        # A spread of few blocks scatters: in 19 of 20 drives it is below this bound.
+            share = min((t / one.goal) ** 2, 1.0) * min(carrying / FEWEST_OF_SPREAD, 1.0)
+            return replace(one, expected=t), share
         freedom = max(carrying - 1.0, 1.0)
-        half = stdtrit(freedom, 0.975) * math.sqrt(chdtri(freedom, 0.05) / freedom / strength)
+        half = stdtrit(freedom, 0.975) / math.sqrt(strength)
         if self._before:
             # What the diagnosis states may be wider than noise alone explains.
             before = max(self._count_blocks(number, 0.0 * weight) - 1.0, 1.0)
             half *= max(one.now * math.sqrt(known) / stdtrit(before, 0.975), 1.0)
-        return half, min((one.goal / half) ** 2, 1.0)
+        most = half * math.sqrt(chdtri(freedom, 0.05) / freedom)
+        return replace(one, expected=float(half), at_most=float(most)), min((one.goal / most) ** 2, 1.0)
 
     def _count_blocks(self, number: int, weight: Floats) -> float:
         """Blocks of the runs and of the drive that carry the information on a number."""
@@ -269,14 +277,15 @@ def make_plan(
     limits: Limits,
     area: Area,
     time_s: float,
-    played: tuple[str, str] = ("/cmd_vel", "geometry_msgs/msg/Twist"),
+    played: tuple[str, str],
     notify: Callable[[str], object] = str,
 ) -> Plan:
     """Choose the shortest list of manoeuvres that decides most of what is open, repeated where that helps.
 
     Args:
         studied: what is known of the vehicle.
-        limits, area: that the drive obeys.
+        limits: that no command exceeds.
+        area: that no model leaves.
         time_s: longest duration, including the zero commands at the start.
         played: topic and message type of the commands.
         notify: called with what is being done.
@@ -284,39 +293,58 @@ def make_plan(
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
     """
+    best: Plan | None = None
     for scale in _SCALES:
         notify(f"manoeuvres at {format_share(scale)} of the largest speed")
         library = list_manoeuvres(studied.vehicle, limits, scale)
         names, seconds = [*library], np.array([one.duration_s for one in library.values()])
         ends = np.cumsum(seconds)
         rehearsal = Rehearsal(join([*library.values()]), studied, ends - seconds)
-        cuts = [np.append(np.arange(end - length + _BLOCK_S, end - 0.5 * _BLOCK_S, _BLOCK_S), end)
-                for length, end in zip(seconds, ends, strict=True)]  # fmt: skip
+        cuts = [
+            np.append(np.arange(end - length + _BLOCK_S, end - 0.5 * _BLOCK_S, _BLOCK_S), end)
+            for length, end in zip(seconds, ends, strict=True)
+        ]
         owner = np.repeat(np.arange(seconds.size), [cut.size for cut in cuts])
         others = list_others(studied, rehearsal, time_s)
         known = rehearsal.recall([*others.values()])
         blocks = rehearsal.inform([*others.values()], np.concatenate(cuts))
         assessment = Assessment(known, blocks, owner, studied.driven_s)
         questions = ask(studied, rehearsal, [*others], known)
-        chosen = _choose(assessment, questions, seconds, time_s - LEAD_S - _TAIL_S)
-        told = _foretell(assessment, questions, seconds, chosen)
-        if not any(one.informs for one in told):
-            # What tells nothing is not driven.
-            chosen = ()
-        pieces = [wait(LEAD_S), *(library[names[number]] for number in chosen), wait(_TAIL_S)]
-        starts = LEAD_S + np.cumsum([0.0, *seconds[[*chosen]]])
-        whole = Rehearsal(join(pieces), studied, starts)
         models = [studied.effects, *((*studied.effects, effect) for effect in others.values())]
-        ways = np.array([whole.trace(effects)[0] for effects in models])
-        if area.holds(ways):
-            return Plan(
-                studied.vehicle.id, tuple(run.name for run in studied.runs),
-                tuple((names[number], float(at)) for number, at in zip(chosen, starts.round(3), strict=False)),
-                join(pieces), limits, area, tuple(told), *played, is_steered(studied.vehicle),
-                _turn_wheels(join(pieces), studied), ways,
-            )  # fmt: skip
-    what, hint = "no manoeuvre fits into the area", "Give a larger --area, or a lower --max-speed."
-    raise PlanError("no_room", what, where=f"{area.length_m:g} x {area.width_m:g} m", hint=hint)
+        whole = chosen = _choose(assessment, questions, seconds, time_s - LEAD_S - _TAIL_S)
+        while True:
+            told = _foretell(assessment, questions, seconds, chosen)
+            if not any(one.informs for one in told):
+                # What tells nothing is not driven, wherever it fits.
+                whole, chosen = () if chosen == whole else whole, ()
+            commands = join([wait(LEAD_S), *(library[names[one]] for one in chosen), wait(_TAIL_S)])
+            starts = LEAD_S + np.cumsum([0.0, *seconds[[*chosen]]])
+            driven = Rehearsal(commands, studied, starts)
+            ways = np.array([driven.trace(effects)[0] for effects in models])
+            if not chosen or area.holds(ways):
+                break
+            chosen = chosen[:-1]
+        made = Plan(
+            studied.vehicle.id,
+            tuple(run.name for run in studied.runs),
+            tuple(zip((names[one] for one in chosen), starts[:-1].round(3).tolist(), strict=True)),
+            commands,
+            limits,
+            area,
+            tuple(told),
+            *played,
+            is_steered(studied.vehicle),
+            _turn_wheels(commands, studied),
+            ways,
+        )
+        if best is None or len(made.decided) > len(best.decided):
+            best = made
+        if chosen == whole:
+            return best
+    if best is None or not best.manoeuvres:
+        what, where = "no drive fits into the area", f"{area.length_m:g} x {area.width_m:g} m"
+        raise PlanError("no_room", what, where=where, hint="Give a larger --area, or a lower --max-speed.")
+    return best
 
 
 def list_others(studied: Studied, rehearsal: Rehearsal, time_s: float) -> dict[str, Effect]:
@@ -348,7 +376,7 @@ def ask(studied: Studied, rehearsal: Rehearsal, others: Sequence[str], known: Fl
 
     Args:
         studied: what is known.
-        rehearsal: whose numbers, and then the other effects, are the rows of the information.
+        rehearsal: commands; its numbers, and then the other effects, are the rows of the information.
         others: ids of the other effects.
         known: information before the drive.
     """
@@ -392,13 +420,13 @@ def ask(studied: Studied, rehearsal: Rehearsal, others: Sequence[str], known: Fl
 def _choose(
     assessment: Assessment, questions: Sequence[Question], seconds: Floats, time_s: float
 ) -> tuple[int, ...]:
-    """Numbers of the manoeuvres of the shortest drive that decides most; empty where none fits in the time."""
+    """Manoeuvres of the shortest drive that decides most, by number; none where the time is too short."""
     best, chosen = (0, 0.0, 0.0), tuple[int, ...]()
     sizes = range(1, seconds.size + 1)
     for one in itertools.chain.from_iterable(itertools.combinations(range(seconds.size), n) for n in sizes):
         length = float(seconds[[*one]].sum())
         for rounds in range(1, int(time_s / length) + 1):
-            counts = np.bincount(one, minlength=seconds.size) * float(rounds)
+            counts = np.bincount(one * rounds, minlength=seconds.size).astype(np.float64)
             shares = [assessment.expect(question, counts)[1] for question in questions]
             decided = sum(share >= 1.0 for share in shares)
             rank = (decided, round(sum(shares), 1), -length * rounds)
@@ -426,7 +454,7 @@ def _foretell(
         more = assessment.expect(one, every)[1] >= 1.0
         needs = "give more --time" if more else suggest_drive(*one.effects)
         expected = assessment.expect(one, counts)[0]
-        told.append(replace(one, expected=expected, decided_after_s=after, needs=needs))
+        told.append(replace(expected, decided_after_s=after, needs=needs))
     return sorted(told, key=lambda one: one.decided_after_s)
 
 

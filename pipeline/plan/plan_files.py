@@ -34,7 +34,7 @@ from pipeline.store import TEMPORARY, Manifest, read_choices, replace_file
 from pipeline.words import describe_separation, suggest_drive
 
 PAGE = "plan.html"
-_CHECKED = ("question", "effects", "kind", "goal", "now", "unit", "expected")
+_CHECKED = ("question", "effects", "kind", "goal", "now", "unit", "expected", "at_most")
 """What a file says of a question, which `slip plan --check` compares with the drive."""
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
 FILES = (*_NAMES, PAGE)
@@ -278,10 +278,11 @@ def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
     for one in plan.promises:
         promised, asked = f"t = {one.expected:.1f}", set(one.effects)
         if one.kind == "interval":
-            promised = f"±{format_digits(one.expected)}{suffix_unit(one.unit)}"
+            unit = suffix_unit(one.unit)
+            promised = f"±{format_digits(one.expected)}{unit}, at most ±{format_digits(one.at_most)}{unit}"
             value = values.get(one.question.partition(" ")[0])
             measured = "not found" if value is None else f"{value.value:.3g} ±{format_digits(value.half)}"
-            is_kept = value is not None and value.half <= one.expected
+            is_kept = value is not None and value.half <= one.at_most
         else:
             named = [effect.id for effect in diagnosis.effects if effect.id in asked]
             is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)

@@ -135,10 +135,12 @@ class Rehearsal:
         times = np.arange(round(end * _POSE_HZ)) / _POSE_HZ
         none, all_ = np.zeros(times.size), np.ones(times.size, dtype=bool)
         flat = np.zeros((times.size, 3))
-        still = Track(times, np.zeros(times.size, np.int64), none + 0j, none, flat, flat[:, :2], all_)
+        still = Track(
+            times, np.zeros(times.size, np.int64), none.astype(np.complex128), none, flat, flat[:, :2], all_
+        )
         run = MotionRun(
-            name="plan", sha256="", terrain="unknown", commands=drive(commands, vehicle), wheels=None, gyro=None,
-            track=still, streams=times, step_starts=starts, excluded=np.zeros(0), duration_s=end,
+            name="plan", sha256="", terrain="unknown", commands=drive(commands, vehicle), wheels=None,
+            gyro=None, track=still, streams=times, step_starts=starts, excluded=np.zeros(0), duration_s=end,
             alignment=Alignment(track_multiplier=multiplier),
         )  # fmt: skip
         self._predictor = RunResiduals(run, vehicle, Input.COMMAND)
