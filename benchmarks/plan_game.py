@@ -106,7 +106,7 @@ def play(seed: int, folder: Path) -> Score:
         studied = study([before], vehicle)
         limits = choose_limits(vehicle, studied.largest, speed_mps=_CAR_MPS if name == "car" else None)
         area = parse_area(_AREAS.get(name, "20x10m"), vehicle)
-        plan = make_plan(studied, limits, area, _SECONDS, choose_topic(vehicle, {}, ""))
+        plan = make_plan(studied, limits, area, _SECONDS, choose_topic(vehicle))
         if not plan.manoeuvres:
             return score
         score.duration_s = plan.commands.duration_s

@@ -90,10 +90,10 @@ def plan(  # noqa: D417 - the runs document themselves
     ground = planning.parse_area(area, chosen)
     with show_progress(at_work, quiet=quiet or json) as progress:
         progress("diagnosis")
-        studied, command, log = planning.Studied(chosen), dict[str, object](), ""
+        studied, first = planning.Studied(chosen), None
         if gathered is not None:
             studied = planning.study(gathered.recordings, chosen, progress)
-            command, log = gathered.command, gathered.recordings[0].path
+            first = gathered.manifests[0]
         limits = planning.choose_limits(
             chosen,
             studied.largest,
@@ -101,7 +101,7 @@ def plan(  # noqa: D417 - the runs document themselves
             yaw_rate_radps=max_yaw_rate,
             acceleration_mps2=max_acceleration,
         )
-        usual = planning.choose_topic(chosen, command, log)
+        usual = planning.choose_topic(chosen, first)
         played = (topic or usual[0], type_name or usual[1])
         made = planning.make_plan(studied, limits, ground, seconds, played, progress)
     files = write_drive(made, folder, results)
@@ -129,12 +129,11 @@ def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) ->
 
 
 class _Gathered(NamedTuple):
-    """Runs of one vehicle, how the command of the first of them was chosen, and whether one had losses."""
+    """Runs of one vehicle, and whether one had losses."""
 
     vehicle: sources.Vehicle
     recordings: list[estimation.Recording]
     manifests: list[Manifest]
-    command: dict[str, object]
     lossy: bool
 
 
@@ -143,17 +142,14 @@ def _gather(
 ) -> _Gathered:
     """Runs of one vehicle, each once, after those that are known already."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan import read_command  # noqa: PLC0415 - heavy
 
     recordings = [] if known is None else [*known.recordings]
     manifests = [] if known is None else [*known.manifests]
     vehicles = [] if known is None else [known.vehicle] * len(recordings)
-    chosen = {} if known is None else known.command
     lossy = known is not None and known.lossy
     for name in names:
         with open_shown(name, options, quiet=quiet) as opened:
             vehicle, recording = read_recording(opened.manifest)
-            chosen = chosen or read_command(opened.manifest)
         lossy |= opened.lossy
         if recording.sha256 and any(recording.sha256 == known.sha256 for known in recordings):
             continue
@@ -166,7 +162,7 @@ def _gather(
         what = f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one"
         where = ", ".join(recording.name for recording in recordings)
         raise SlipError("several_vehicles", what, where=where, hint="Give runs of one vehicle.")
-    return _Gathered(vehicles[0], recordings, manifests, chosen, lossy)
+    return _Gathered(vehicles[0], recordings, manifests, lossy)
 
 
 def _find_vehicle(name: str | None) -> sources.Vehicle:
@@ -193,7 +189,7 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
         what = f"the plan is for {stored.vehicle}, and the log is of {drive.vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
-    vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
+    vehicle, recordings, _, lossy = _gather(before, options, quiet=quiet, known=drive)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
         driven = [estimation.load_recording(recording, vehicle) for recording in drive.recordings]

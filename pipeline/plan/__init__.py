@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         FILES,
         check_plan,
         choose_topic,
-        read_command,
         read_plan,
         require_played,
         write_plan,

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
-import msgspec
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
@@ -42,8 +41,7 @@ from pipeline.plan.manoeuvres import (
     list_manoeuvres,
     wait,
 )
-from pipeline.plan.rehearsal import Rehearsal, Studied, drive
-from pipeline.run import Alignment
+from pipeline.plan.rehearsal import Rehearsal, Studied
 from pipeline.words import suggest_drive
 
 DECIDED_T = 5.0
@@ -125,8 +123,6 @@ class Plan:
         questions: all that is open; what is decided first stands first.
         topic, type_name: topic on which the commands are played, and its type.
         steered: whether a turn is a steering angle.
-        wheels: commanded speeds of the left and the right wheels [rad/s], shape (n,) each; None if the drive
-            has other inputs.
         ways: paths of the known model, first, and of those with one effect more, positions x + iy [m] at
             20 Hz, shape (models, n).
     """
@@ -141,7 +137,6 @@ class Plan:
     topic: str
     type_name: str
     steered: bool
-    wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
 
     @property
@@ -306,7 +301,7 @@ def make_plan(
         ]
         owner = np.repeat(np.arange(seconds.size), [cut.size for cut in cuts])
         others = list_others(studied, rehearsal, time_s)
-        known = rehearsal.recall([*others.values()])
+        known = rehearsal.recall(len(others))
         blocks = rehearsal.inform([*others.values()], np.concatenate(cuts))
         assessment = Assessment(known, blocks, owner, studied.driven_s)
         questions = ask(studied, rehearsal, [*others], known)
@@ -334,7 +329,6 @@ def make_plan(
             tuple(told),
             *played,
             is_steered(studied.vehicle),
-            _turn_wheels(commands, studied),
             ways,
         )
         if best is None or len(made.decided) > len(best.decided):
@@ -380,7 +374,7 @@ def ask(studied: Studied, rehearsal: Rehearsal, others: Sequence[str], known: Fl
         others: ids of the other effects.
         known: information before the drive.
     """
-    numbers = rehearsal.list_numbers()
+    numbers = rehearsal.numbers
     base, row_of = tuple(range(len(numbers))), {name: len(numbers) + at for at, name in enumerate(others)}
     diagnosis = studied.diagnosis
     groups = () if diagnosis is None else tuple(group.candidates for group in diagnosis.undecided)
@@ -399,8 +393,6 @@ def ask(studied: Studied, rehearsal: Rehearsal, others: Sequence[str], known: Fl
     }
     values = {effect.id: effect.values for effect in studied.effects}
     for row, number in enumerate(numbers):
-        if not number.effect:
-            continue
         rows = ((*base[:row], *base[row + 1 :], row),)
         value = values[number.effect][number.name]
         goal = find_goal(number.effect, number.name, value)
@@ -456,14 +448,3 @@ def _foretell(
         expected = assessment.expect(one, counts)[0]
         told.append(replace(expected, decided_after_s=after, needs=needs))
     return sorted(told, key=lambda one: one.decided_after_s)
-
-
-def _turn_wheels(commands: Commands, studied: Studied) -> tuple[Floats, Floats] | None:
-    """Wheel commands in the scale of a recorded log."""
-    if studied.vehicle.kinematics.has_inputs("sideways") or is_steered(studied.vehicle):
-        return None
-    known = studied.runs[0].alignment if studied.runs else Alignment()
-    driven = drive(commands, msgspec.structs.replace(studied.vehicle, controller_track_multiplier=1.0))
-    ahead = 0.5 * (driven.left + driven.right) / known.command_scale
-    apart = 0.5 * (driven.right - driven.left) / known.command_turn_scale
-    return ahead - apart, ahead + apart

@@ -1,8 +1,7 @@
 """Files of a plan, and the comparison of its expected gains with the drive."""
 
-import csv
+import io
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,22 +21,19 @@ from pipeline.core import (
     read_bounded_text,
     suffix_unit,
 )
-from pipeline.logs import LogError, locate_recorded, open_log
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
 from pipeline.plan.manoeuvres import LONGEST_S, RATE_HZ, PlanError, is_steered
 from pipeline.plan.plan import SAFETY, Plan, Question
 from pipeline.results import RunDiagnosis
-from pipeline.run import DriveSeries, MotionRun, name_inputs
+from pipeline.run import MotionRun, name_inputs
 from pipeline.sources import Vehicle
-from pipeline.store import TEMPORARY, Manifest, read_choices, replace_file
+from pipeline.store import Manifest, read_choices, replace_file
 from pipeline.words import describe_separation, suggest_drive
 
-PAGE = "plan.html"
 _CHECKED = ("question", "effects", "kind", "goal", "now", "unit", "expected", "at_most")
 """What a file says of a question, which `slip plan --check` compares with the drive."""
-_NAMES = ("plan.toml", "plan.csv", "plan.mcap")
-FILES = (*_NAMES, PAGE)
+FILES = ("plan.toml", "plan.csv", "plan.mcap", "plan.html")
 # Fields of speed and turn by message type.
 _FIELDS: Mapping[str, tuple[str, str]] = {
     "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
@@ -45,60 +41,21 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
     "ackermann_msgs/msg/AckermannDrive": ("speed", "steering_angle"),
     "ackermann_msgs/msg/AckermannDriveStamped": ("drive.speed", "drive.steering_angle"),
 }
-WHEELS = "std_msgs/msg/Float64"
-"""Message type of wheel speeds [rad/s], one topic per side."""
-_PAIR = 2
 # A player shifts log times to the present; a fixed first stamp makes the bytes of equal plans equal.
 _START_NS = 1_700_000_000_000_000_000
 _SECOND = 1_000_000_000
 
 
-def read_command(manifest: Manifest) -> dict[str, object]:
-    """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
-    configuration = manifest.details.get("configuration")
-    source = configuration.get("command") if isinstance(configuration, dict) else None
-    return {**read_choices(manifest), "command_source": source}
-
-
-def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> tuple[str, str]:
-    """Topics and type of the command in a log; the vehicle's usual one if the log has none.
-
-    A body command has priority over a pair of wheel speeds [rad/s].
-    """
+def choose_topic(vehicle: Vehicle, manifest: Manifest | None = None) -> tuple[str, str]:
+    """Topic and type of the body command of a stored run; the vehicle's usual one if it has none."""
     types = list_types(steered=is_steered(vehicle))
-    chosen = choices.get("choices")
+    chosen = None if manifest is None else read_choices(manifest).get("choices")
     command = chosen.get("command") if isinstance(chosen, dict) else None
-    asked: list[str] = []
-    if isinstance(command, dict):
-        asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]
-    message_types = _read_types(log) if asked else {}
-    for topic in asked:
-        if message_types.get(topic) in types:
-            return topic, message_types[topic]
-    if isinstance(command, dict) and command.get("type") == WHEELS and _is_plain(choices, vehicle):
-        sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
-        if len(sides) == 2:  # noqa: PLR2004 - left and right
-            return ", ".join(sides), WHEELS
+    if isinstance(command, dict) and command.get("type") in types:
+        return str(command["topic"]), str(command["type"])
     # The topic of a single motor does not accept body commands.
     usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
     return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
-
-
-def _read_types(log: str) -> Mapping[str, str]:
-    """Message types by topic of a stored run's log; empty if the log is missing or not accessible."""
-    try:
-        location = locate_recorded(log)
-    except LogError:
-        return {}
-    return open_log(location).types if location.exists() else {}
-
-
-def _is_plain(choices: Mapping[str, object], vehicle: Vehicle) -> bool:
-    """Whether recorded wheel commands are in rad/s, positive forward."""
-    asked = choices.get("command_source")
-    source = asked if isinstance(asked, dict) else {}
-    unit, sign = source.get("unit"), source.get("sign")
-    return not vehicle.units and unit in {None, "rad/s"} and sign in {None, 1} and not source.get("per_turn")
 
 
 def list_types(*, steered: bool) -> tuple[str, ...]:
@@ -131,27 +88,22 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
     Raises:
         PlanError: ``cannot_write``, or ``wrong_type`` for a message type that cannot carry the commands.
     """
-    types = [*list_types(steered=plan.steered), *([WHEELS] if plan.wheels is not None else [])]
-    topics = plan.topic.split(", ")
-    if plan.type_name not in types or len(topics) != (_PAIR if plan.type_name == WHEELS else 1):
+    types = list_types(steered=plan.steered)
+    if plan.type_name not in types:
         what = f"commands of this vehicle cannot be written as {plan.type_name}"
-        hint = f"Give --type as one of {', '.join(types)}; {WHEELS} on --topic '/LEFT, /RIGHT'."
+        hint = f"Give --type as one of {', '.join(types)}."
         raise PlanError("wrong_type", what, where=plan.topic, hint=hint)
-    toml, csv, mcap = _NAMES
-    texts = {csv: _format_csv(plan), toml: _format_toml(plan), **({PAGE: page} if page else {})}
+    texts = (_format_toml(plan).encode(), _format_csv(plan).encode(), _format_mcap(plan), page.encode())
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # All are whole before the first takes its place: an interrupted plan leaves the earlier one.
-        with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as drafts:
-            _write_mcap(plan, Path(drafts) / mcap)
-            for name, text in texts.items():
-                replace_file(Path(drafts) / name, text.encode())
-            for name in (mcap, *texts):
-                (Path(drafts) / name).replace(folder / name)
+        for name, text in zip(FILES, texts, strict=True):
+            if text:
+                replace_file(folder / name, text)
     except OSError as error:
         what = f"the plan cannot be written ({error.strerror})"
         raise PlanError("cannot_write", what, where=str(folder), hint="Choose another --folder.") from None
-    return tuple(folder / name for name in (*_NAMES, *([PAGE] if page else [])))
+    return tuple(folder / name for name, text in zip(FILES, texts, strict=True) if text)
 
 
 def read_plan(path: Path) -> StoredPlan:
@@ -161,7 +113,7 @@ def read_plan(path: Path) -> StoredPlan:
         PlanError: ``no_plan``, the file is missing or is not a plan.
         MotionError: ``unknown_effect``, a question concerns an unknown effect.
     """
-    file = path / _NAMES[0] if path.is_dir() else path
+    file = path / FILES[0] if path.is_dir() else path
     try:
         stored = msgspec.convert(parse_toml(read_bounded_text(file)), StoredPlan)
     except OSError as error:
@@ -177,40 +129,25 @@ def read_plan(path: Path) -> StoredPlan:
     raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
 
 
-def _write_mcap(plan: Plan, path: Path) -> None:
-    topics = plan.topic.split(", ")
-    definition = definition_text(plan.type_name)
+def _format_mcap(plan: Plan) -> bytes:
+    definition, content = definition_text(plan.type_name), io.BytesIO()
     if definition is None:
         raise AssertionError(plan.type_name)
-    with path.open("wb") as file, Writer(file) as writer:
+    with Writer(content) as writer:
         schema = writer.register_msgdef(plan.type_name, definition)
-        for number, row in enumerate(zip(plan.commands.times, *_list_values(plan), strict=True)):
-            at = _START_NS + round(float(row[0]) * _SECOND)
-            header = {"header": {"stamp": {"sec": at // _SECOND, "nanosec": at % _SECOND}}}
-            for topic, message in zip(topics, row[1:], strict=True):
-                writer.write_message(topic, schema, header | message, at, at, number)
+        rows = zip(plan.commands.times, plan.commands.speed, plan.commands.turn, strict=True)
+        for number, (time, *values) in enumerate(rows):
+            at = _START_NS + round(float(time) * _SECOND)
+            message: dict[str, Any] = {"header": {"stamp": {"sec": at // _SECOND, "nanosec": at % _SECOND}}}
+            for path, value in zip(_FIELDS[plan.type_name], values, strict=True):
+                *outer, name = path.split(".")
+                inner = message
+                for key in outer:
+                    inner = inner.setdefault(key, {})
+                inner[name] = float(value)
+            writer.write_message(plan.topic, schema, message, at, at, number)
         writer.add_metadata("safety", {"text": " ".join(SAFETY)})
-
-
-def _list_values(plan: Plan) -> list[list[dict[str, object]]]:
-    """Messages of every topic, without header; fields that they lack are zero."""
-    if plan.type_name == WHEELS and plan.wheels is not None:
-        return [[{"data": float(value)} for value in side] for side in plan.wheels]
-    paths = _FIELDS[plan.type_name]
-    pairs = zip(plan.commands.speed.tolist(), plan.commands.turn.tolist(), strict=True)
-    return [[_nest(dict(zip(paths, pair, strict=True))) for pair in pairs]]
-
-
-def _nest(values: Mapping[str, float]) -> dict[str, object]:
-    """Nested fields of a message from values by path, for example ``twist.linear.x``."""
-    message: dict[str, object] = {}
-    for path, value in values.items():
-        *outer, name = path.split(".")
-        inner: dict[str, Any] = message
-        for key in outer:
-            inner = inner.setdefault(key, {})
-        inner[name] = value
-    return message
+    return content.getvalue()
 
 
 def _format_csv(plan: Plan) -> str:
@@ -312,14 +249,28 @@ def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> N
         vehicle: their vehicle.
 
     Raises:
-        PlanError: ``not_played``.
+        PlanError: ``not_played``; ``no_plan``, the file cannot be read.
     """
     if not path.is_file() or any(run.commands is None for run in runs):
         return
-    asked = _read_plan(path, vehicle)
-    likeness = max(find_likeness(asked, _sample(run.commands, vehicle)) for run in runs if run.commands)
-    if likeness < _ALIKE:
-        what = f"no stretch of these commands matches the plan (similarity {format_share(likeness)})"
+    try:
+        _, speed, turn = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2).T
+    except (OSError, ValueError) as error:
+        what = "this is not a plan.csv that `slip plan` wrote"
+        hint = "Give the folder that `slip plan` wrote."
+        raise PlanError("no_plan", what, where=str(path), hint=hint) from error
+    if is_steered(vehicle):
+        _, _, turn = vehicle.kinematics.asked({"speed": speed, "steering": turn}, vehicle)
+    likeness = []
+    for series in (run.commands for run in runs if run.commands):
+        ahead, _, turned = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        # A silence is as long as the longest plan at most.
+        at = np.append(0.0, np.cumsum(np.minimum(np.diff(series.times), LONGEST_S)))
+        held = np.searchsorted(at, np.arange(0.0, at[-1], 1.0 / RATE_HZ), side="right") - 1
+        seen = np.column_stack((ahead, turned))[held]
+        likeness.append(find_likeness(np.column_stack((speed, turn)), seen))
+    if max(likeness) < _ALIKE:
+        what = f"no stretch of these commands matches the plan (similarity {format_share(max(likeness))})"
         hint = "Give the log in which the plan was driven."
         raise PlanError("not_played", what, where=", ".join(run.name for run in runs), hint=hint)
 
@@ -337,26 +288,3 @@ def find_likeness(asked: Floats, seen: Floats) -> float:
     energy = np.concatenate(([0.0], np.cumsum(np.sum(seen**2, axis=1))))
     sizes = np.sqrt(np.maximum(energy[len(asked) :] - energy[: -len(asked)], 1e-9) * np.sum(asked**2))
     return float(np.max(together / sizes))
-
-
-def _read_plan(path: Path, vehicle: Vehicle) -> Floats:
-    try:
-        names, *rows = csv.reader(read_bounded_text(path).splitlines())
-        _, speed, turn = np.array(rows, dtype=np.float64).T
-    except (OSError, ValueError, csv.Error) as error:
-        what = "this is not a plan.csv that `slip plan` wrote"
-        hint = "Give the folder that `slip plan` wrote."
-        raise PlanError("no_plan", what, where=str(path), hint=hint) from error
-    if names[-1].startswith("steering"):
-        _, _, turn = vehicle.kinematics.asked({"speed": speed, "steering": turn}, vehicle)
-    return np.column_stack((speed, turn))
-
-
-def _sample(series: DriveSeries, vehicle: Vehicle) -> Floats:
-    """Forward speed and yaw rate of a log's commands, each held, at the plan's rate."""
-    speed, _, turn = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
-    # A silence is as long as the longest plan at most.
-    played = np.append(0.0, np.cumsum(np.minimum(np.diff(series.times), LONGEST_S)))
-    times = np.arange(0.0, played[-1], 1.0 / RATE_HZ)
-    held = np.maximum(np.searchsorted(played, times, side="right") - 1, 0)
-    return np.column_stack((speed[held], turn[held]))

@@ -154,7 +154,7 @@ def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable
     ground, seconds = plan.parse_area(area, vehicle), plan.parse_time(_TIME)
     studied = plan.study([recording], vehicle, notify)
     limits = plan.choose_limits(vehicle, studied.largest)
-    played = plan.choose_topic(vehicle, plan.read_command(manifest), recording.path)
+    played = plan.choose_topic(vehicle, manifest)
     made = plan.make_plan(studied, limits, ground, seconds, played, notify)
     leave_plan(store, manifest, made)
 

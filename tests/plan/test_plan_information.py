@@ -114,7 +114,7 @@ def test_what_a_straight_drive_hides_is_what_the_plan_decides(tmp_path: Path) ->
     vehicle, recording = record(straight, tmp_path / "straight.mcap")
     studied = study([recording], vehicle)
     limits = choose_limits(vehicle, studied.largest)
-    plan = make_plan(studied, limits, parse_area("20x10m", vehicle), 60.0, choose_topic(vehicle, {}, ""))
+    plan = make_plan(studied, limits, parse_area("20x10m", vehicle), 60.0, choose_topic(vehicle))
     decided = {name for one in plan.decided for name in one.effects}
     assert {"drive_lag", "turn_lag", "lateral_skid", "icr_offset"} <= decided
     assert {name for name, _ in plan.manoeuvres} - {"straight with steps of speed"}
@@ -142,7 +142,7 @@ def test_without_a_run_every_effect_of_the_vehicle_is_open() -> None:
     vehicle = find_preset("car")
     assert vehicle is not None
     limits, area = choose_limits(vehicle, speed_mps=4.0), parse_area("80x60m", vehicle)
-    plan = make_plan(Studied(vehicle), limits, area, 120.0, choose_topic(vehicle, {}, ""))
+    plan = make_plan(Studied(vehicle), limits, area, 120.0, choose_topic(vehicle))
     asked = {name for one in plan.questions for name in one.effects}
     assert {"understeer", "steering_offset", "drive_lag"} <= asked
     assert all(vehicle.kind in find_effect(name).kinds for name in asked)
