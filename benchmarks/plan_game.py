@@ -117,7 +117,7 @@ def play(seed: int, folder: Path) -> Score:
         score.left_area = not replace(area, margin_m=0.0).holds(way[:, 0] + 1j * way[:, 1])
         _, after = record(driven, folder / "after.mcap")
         check = check_plan(read_plan(folder / "plan"), diagnose_runs([before, after], vehicle).runs[0])
-        score.promises = [*check.kept]
+        score.promises = [*check.outcomes]
     except SlipError as error:
         score.error = str(error)
     return score

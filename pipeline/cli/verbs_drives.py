@@ -199,12 +199,12 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
     if json:
         following_up = following if diagnosis.undecided else None
-        print_json({"kept": checked.kept, "open": checked.open, "next": following_up, "errors": []})
+        print_json({"kept": checked.outcomes, "open": checked.open, "next": following_up, "errors": []})
     elif not quiet:
         rows = [
             f"{'kept' if one['kept'] else 'NOT KEPT':<9} {one['question']}: "
             f"promised {one['promised']}, {one['measured']}"
-            for one in checked.kept
+            for one in checked.outcomes
         ]
         rows += [f"open      {text}" for text in checked.open]
         rows = rows or ["the plan promised nothing"]
@@ -225,12 +225,12 @@ def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = 
 
     runs = f"after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
     if not made.questions:
-        return [f"nothing is open {runs}: no cause is undecided, and each number is known well enough"]
+        return [f"no open question {runs}: no cause is undecided, and each number is known well enough"]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
     rows = align_rows([(f"open {runs}".strip(), "so far", "with this drive"), *made.list_rows()])
     most = f"limits       {made.limits.format(steered=made.steered)}"
     if not made.manoeuvres:
-        nothing = f"no drive on {ground} of level ground tells any of what is open: no file is written"
+        nothing = f"no drive on {ground} of level ground answers an open question: no file is written"
         return [nothing, *(f"  {row}" for row in rows), most]
     names = [f"{number} x {name}" for name, number in Counter(name for name, _ in made.manoeuvres).items()]
     return [

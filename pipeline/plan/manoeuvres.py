@@ -220,7 +220,7 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits, scale: float = 1.0) -> dic
     def return_after(*stages: tuple[float, float, float]) -> Commands:
         """Targets of (speed, turn, seconds), one after the other, and back."""
         counts = [round(seconds * RATE_HZ) for _, _, seconds in stages]
-        fast, turned = (np.repeat([stage[place] for stage in stages], counts) for place in (0, 1))
+        fast, turned = (np.repeat([stage[index] for stage in stages], counts) for index in (0, 1))
         return _return(_limit(fast, turned, vehicle, limits), steered=steered)
 
     time = np.arange(round(_SLALOM_S * RATE_HZ)) / RATE_HZ

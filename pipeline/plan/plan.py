@@ -53,6 +53,8 @@ _TAIL_S = 1.0
 _BLOCK_S = 7.0
 # Largest expected half-width, relative to that so far, that counts as narrower.
 _NARROWER = 0.9
+# How often a list of manoeuvres is repeated at most: more is another drive.
+_MOST_ROUNDS = 8
 # Shares of the largest speed that are tried until the drive stays inside the area.
 _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
 
@@ -140,7 +142,7 @@ class Plan:
     ways: Complex = field(repr=False)
 
     @property
-    def promises(self) -> tuple[Question, ...]:
+    def informative(self) -> tuple[Question, ...]:
         """Questions of which the drive tells something."""
         return tuple(one for one in self.questions if one.informs)
 
@@ -162,24 +164,24 @@ class Plan:
             parts[0] += f" in {format_duration(self.commands.duration_s)}: " + name_first(
                 dict.fromkeys(one.name for one in decided)
             )
-        if narrowed := len(self.promises) - len(decided):
+        if narrowed := len(self.informative) - len(decided):
             parts.append(f"narrows {narrowed}")
         return "; ".join(parts)
 
     def list_rows(self) -> list[Row]:
         """The open questions: those that the drive decides, in their order, then the others."""
         rows = []
-        for one in self.promises:
+        for one in self.informative:
             is_decided = math.isfinite(one.decided_after_s)
             after = f"after {format_duration(one.decided_after_s)}" if is_decided else ""
             if one.kind == "separation":
                 rows.append((one.name, "undecided", f"decided {after}"))
             elif one.kind == "interval":
                 unit = suffix_unit(one.unit)
-                told = f"±{format_digits(one.expected)}{unit}"
-                told += f"; ±{format_digits(one.goal)} {after}" if after else ""
-                rows.append((one.name, f"{one.value:.3g} ±{format_digits(one.now)}{unit}", told))
-        seen = [one for one in self.promises if one.kind == "presence"]
+                text = f"±{format_digits(one.expected)}{unit}"
+                text += f"; ±{format_digits(one.goal)} {after}" if after else ""
+                rows.append((one.name, f"{one.value:.3g} ±{format_digits(one.now)}{unit}", text))
+        seen = [one for one in self.informative if one.kind == "presence"]
         if seen:
             after = f"seen after {format_duration(seen[-1].decided_after_s)}, if acting"
             rows.append((name_first([one.name for one in seen]), "not seen", after))
@@ -207,7 +209,7 @@ class Plan:
                     "decided_after_s": finite_or_none(one.decided_after_s),
                     ("interval_after_s" if one.kind == "interval" else "expected_t"): one.expected,
                 }
-                for one in self.promises
+                for one in self.informative
             ],
             "impossible": [
                 {"question": one.question, "effects": list(one.effects), "because": one.needs}
@@ -286,7 +288,7 @@ def make_plan(
         notify: called with what is being done.
 
     Raises:
-        PlanError: ``no_room``, no manoeuvre fits into the area and the time.
+        PlanError: ``no_room``, no manoeuvre fits into the area.
     """
     best: Plan | None = None
     for scale in _SCALES:
@@ -308,8 +310,8 @@ def make_plan(
         models = [studied.effects, *((*studied.effects, effect) for effect in others.values())]
         whole = chosen = _choose(assessment, questions, seconds, time_s - LEAD_S - _TAIL_S)
         while True:
-            told = _foretell(assessment, questions, seconds, chosen)
-            if not any(one.informs for one in told):
+            answers = _foretell(assessment, questions, seconds, chosen)
+            if not any(one.informs for one in answers):
                 # What tells nothing is not driven, wherever it fits.
                 whole, chosen = () if chosen == whole else whole, ()
             commands = join([wait(LEAD_S), *(library[names[one]] for one in chosen), wait(_TAIL_S)])
@@ -326,7 +328,7 @@ def make_plan(
             commands,
             limits,
             area,
-            tuple(told),
+            tuple(answers),
             *played,
             is_steered(studied.vehicle),
             ways,
@@ -417,7 +419,7 @@ def _choose(
     sizes = range(1, seconds.size + 1)
     for one in itertools.chain.from_iterable(itertools.combinations(range(seconds.size), n) for n in sizes):
         length = float(seconds[[*one]].sum())
-        for rounds in range(1, int(time_s / length) + 1):
+        for rounds in range(1, min(int(time_s / length), _MOST_ROUNDS) + 1):
             counts = np.bincount(one * rounds, minlength=seconds.size).astype(np.float64)
             shares = [assessment.expect(question, counts)[1] for question in questions]
             decided = sum(share >= 1.0 for share in shares)
@@ -433,7 +435,7 @@ def _foretell(
     assessment: Assessment, questions: Sequence[Question], seconds: Floats, chosen: Sequence[int]
 ) -> list[Question]:
     """The questions with what these manoeuvres, one after the other, are expected to tell of each."""
-    told = []
+    answers = []
     every = np.full(seconds.size, LONGEST_S / float(seconds.sum()))
     for one in questions:
         after = math.inf
@@ -443,8 +445,8 @@ def _foretell(
                 after = round(LEAD_S + float(seconds[[*chosen[:count]]].sum()), 3)
                 break
         counts = np.bincount(np.array(chosen, np.int64), minlength=seconds.size).astype(np.float64)
-        more = assessment.expect(one, every)[1] >= 1.0
-        needs = "give more --time" if more else suggest_drive(*one.effects)
+        is_slow = assessment.expect(one, every)[1] >= 1.0
+        needs = "give more --time" if is_slow else suggest_drive(*one.effects)
         expected = assessment.expect(one, counts)[0]
-        told.append(replace(expected, decided_after_s=after, needs=needs))
-    return sorted(told, key=lambda one: one.decided_after_s)
+        answers.append(replace(expected, decided_after_s=after, needs=needs))
+    return sorted(answers, key=lambda one: one.decided_after_s)

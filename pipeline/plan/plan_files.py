@@ -178,7 +178,7 @@ def _format_toml(plan: Plan) -> str:
     lines += _format_table({**asdict(plan.area), "home_m": plan.home_m})
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
-    for one in plan.promises:
+    for one in plan.informative:
         lines += ["", "[[promises]]", *_format_table({name: getattr(one, name) for name in _CHECKED})]
     return "\n".join(lines) + "\n"
 
@@ -192,11 +192,11 @@ class Check:
     """Outcomes of a plan.
 
     Attributes:
-        kept: ``question``, ``promised`` and ``measured`` as text, and ``kept``, for each promise.
+        outcomes: ``question``, ``promised`` and ``measured`` as text, and ``kept``, for each promise.
         open: what remains open, with what would decide it, as text.
     """
 
-    kept: tuple[dict[str, str | bool], ...]
+    outcomes: tuple[dict[str, str | bool], ...]
     open: tuple[str, ...]
 
 
@@ -211,29 +211,31 @@ def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
         for effect in diagnosis.effects
         for name, value in effect.parameters.items()
     }
-    kept: list[dict[str, str | bool]] = []
+    outcomes: list[dict[str, str | bool]] = []
     for one in plan.promises:
-        promised, asked = f"t = {one.expected:.1f}", set(one.effects)
+        expected, asked = f"t = {one.expected:.1f}", set(one.effects)
         if one.kind == "interval":
             unit = suffix_unit(one.unit)
-            promised = f"±{format_digits(one.expected)}{unit}, at most ±{format_digits(one.at_most)}{unit}"
+            expected = f"±{format_digits(one.expected)}{unit}, at most ±{format_digits(one.at_most)}{unit}"
             value = values.get(one.question.partition(" ")[0])
             measured = "not found" if value is None else f"{value.value:.3g} ±{format_digits(value.half)}"
-            is_kept = value is not None and value.half <= one.at_most
+            is_met = value is not None and value.half <= one.at_most
         else:
             named = [effect.id for effect in diagnosis.effects if effect.id in asked]
             is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
             # What is identified explains the motion, which excludes its rival.
-            is_kept = not is_ambiguous and bool(named or not asked & diagnosis.unobservable_why.keys())
+            is_met = not is_ambiguous and bool(named or not asked & diagnosis.unobservable_why.keys())
             # With more data what two effects share may vanish: that is a decision, too.
-            measured = (" and ".join(named) or "decided: no effect") if is_kept else "still open"
-        kept.append({"question": one.question, "promised": promised, "measured": measured, "kept": is_kept})
+            measured = (" and ".join(named) or "decided: no effect") if is_met else "still open"
+        outcomes.append(
+            {"question": one.question, "promised": expected, "measured": measured, "kept": is_met}
+        )
     still = [
         f"{' or '.join(group.candidates)}: {describe_separation(group)}" for group in diagnosis.undecided
     ]
     hidden = group_by((suggest_drive(name), name) for name in diagnosis.unobservable_why)
     still += [f"{', '.join(names)}: {advice}" for advice, names in hidden.items()]
-    return Check(tuple(kept), tuple(still))
+    return Check(tuple(outcomes), tuple(still))
 
 
 _ALIKE = 0.6

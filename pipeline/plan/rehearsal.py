@@ -181,11 +181,11 @@ class Rehearsal:
             residual = path.find_residuals(state)
             columns = np.zeros((*residual.shape, size))
             owned = {effect.id for effect in state.effects if path.owns(effect)}
-            mine = [place for place, one in enumerate(self.numbers) if one.effect in owned]
+            mine = [row for row, one in enumerate(self.numbers) if one.effect in owned]
             columns[:, :, mine] = path.differentiate(state, residual, [self.numbers[one] for one in mine])
-            for place, effect in enumerate(others, start=len(self.numbers)):
+            for row, effect in enumerate(others, start=len(self.numbers)):
                 if path.owns(effect):
-                    columns[:, :, place] = residual - path.find_residuals(state.add(effect))
+                    columns[:, :, row] = residual - path.find_residuals(state.add(effect))
             white = noise.whiten(columns, path.steps)
             group = np.minimum(np.searchsorted(ends, path.times[:, 1] - _ROUNDING_S), ends.size - 1)
             for number in range(ends.size):
@@ -195,10 +195,10 @@ class Rehearsal:
 
     def recall(self, others: int) -> Floats:
         """Information before the drive on the same, next to none on amounts of others, shape (q, q)."""
-        place_of, spread = dict[str, int](), list[float]()
+        row_of, spread = dict[str, int](), list[float]()
         by_id = {effect.id: effect for effect in self.studied.effects}
-        for place, number in enumerate(self.numbers):
-            place_of[number.label] = place
+        for row, number in enumerate(self.numbers):
+            row_of[number.label] = row
             parameter = by_id[number.effect].parameter(number.name)
             neutral = parameter.neutral if np.isfinite(parameter.neutral) else 0.0
             value = by_id[number.effect].values[number.name]
@@ -206,8 +206,8 @@ class Rehearsal:
             spread.append(max(abs(value - neutral), abs(parameter.typical - neutral), parameter.step))
         total = np.diag([*(np.array(spread) ** -2.0), *np.full(others, _NOTHING)])
         for fit in () if self.studied.fitted is None else self.studied.fitted.fits:
-            mine = [i for i, one in enumerate(fit.free) if one.label in place_of and one.acts_in(0)]
-            at = [place_of[fit.free[one].label] for one in mine]
+            mine = [i for i, one in enumerate(fit.free) if one.label in row_of and one.acts_in(0)]
+            at = [row_of[fit.free[one].label] for one in mine]
             # Clocks of the runs, and numbers of other grounds, are marginalized.
             total[np.ix_(at, at)] += np.linalg.inv(fit.covariance[np.ix_(mine, mine)])
         return total

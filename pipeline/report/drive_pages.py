@@ -93,7 +93,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
         safety=SAFETY,
         play=_format_play(plan),
         rows=plan.list_rows(),
-        has_intervals=any(one.kind == "interval" for one in plan.promises),
+        has_intervals=any(one.kind == "interval" for one in plan.informative),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 

@@ -166,7 +166,7 @@ def test_the_official_reader_reads_body_commands_within_the_limits(
     _check_limits(speed, turn, _find("husky_a200"), plan)
     assert np.allclose(speed, np.loadtxt(csv, delimiter=",", skiprows=1)[:, 1], atol=1e-6)
     stored = read_plan(toml)
-    assert [one.question for one in stored.promises] == [one.question for one in plan.promises]
+    assert [one.question for one in stored.promises] == [one.question for one in plan.informative]
 
 
 @pytest.mark.parametrize("type_name", list_types(steered=True))
@@ -197,7 +197,7 @@ def test_the_simulator_plays_the_commands_and_another_type_is_refused(plan: Plan
 
 def test_a_slope_cannot_be_promised_on_level_ground(plan: Plan) -> None:
     slopes = {one.id for one in list_effects() if Excitation.SLOPE in one.needs}
-    assert not slopes & {name for one in plan.promises for name in one.effects}
+    assert not slopes & {name for one in plan.informative for name in one.effects}
     told = [row for row in plan.list_rows() if row[1] == "not by this drive"]
     assert any("drive on a slope" in needs for _, _, needs in told)
 

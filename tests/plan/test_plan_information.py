@@ -89,7 +89,7 @@ def _diagnose(effects: tuple[str, ...] = (), undecided: tuple[tuple[str, ...], .
 
 
 def _list_kept(plan: StoredPlan, diagnosis: RunDiagnosis) -> list[object]:
-    return [one["kept"] for one in check_plan(plan, diagnosis).kept]
+    return [one["kept"] for one in check_plan(plan, diagnosis).outcomes]
 
 
 def test_promises_are_checked_against_what_came_out() -> None:
@@ -98,11 +98,11 @@ def test_promises_are_checked_against_what_came_out() -> None:
     plan = StoredPlan("husky", [], [pair, narrow, tight])
     assert _list_kept(plan, _diagnose(("a",))) == [True, True, False]
     still = check_plan(plan, _diagnose((), (("a", "b"),)))
-    assert [one["measured"] for one in still.kept] == ["still open", "not found", "not found"]
+    assert [one["measured"] for one in still.outcomes] == ["still open", "not found", "not found"]
     assert still.open[0].startswith("a or b: ")
     # Beside what is named a rival may not be seen: that decides; with nothing named it does not.
     hidden = {"b": Unobservable("collinear with what was named")}
-    told = check_plan(plan, msgspec.structs.replace(_diagnose(("a",)), unobservable_why=hidden)).kept[0]
+    told = check_plan(plan, msgspec.structs.replace(_diagnose(("a",)), unobservable_why=hidden)).outcomes[0]
     assert (told["kept"], told["measured"]) == (True, "a")
     assert not _list_kept(plan, msgspec.structs.replace(_diagnose(), unobservable_why=hidden))[0]
 
