@@ -28,8 +28,9 @@ from pipeline.core import (
     pick,
     suffix_unit,
 )
+from pipeline.estimation import ModelState
 from pipeline.estimation.driving_need import find_goal
-from pipeline.models import Effect, find_effect, list_effects, name_number, name_term
+from pipeline.models import Effect, Timing, find_effect, list_effects, name_number, name_term
 from pipeline.plan.manoeuvres import (
     LONGEST_S,
     Area,
@@ -44,6 +45,8 @@ from pipeline.plan.manoeuvres import (
 from pipeline.plan.rehearsal import Rehearsal, Studied
 from pipeline.words import suggest_drive
 
+# Sizes of effects that may act unnoticed, as multiples of the usual ones, for the area of a drive.
+_SIZES = (0.7, 1.0, 1.5, 2.0)
 DECIDED_T = 5.0
 """Expected t of what a drive decides: the diagnosis decides at 1.6, and t scatters by one between drives."""
 LEAD_S = 3.0
@@ -307,7 +310,9 @@ def make_plan(
         blocks = rehearsal.inform([*others.values()], np.concatenate(cuts))
         assessment = Assessment(known, blocks, owner, studied.driven_s)
         questions = ask(studied, rehearsal, [*others], known)
-        models = [studied.effects, *((*studied.effects, effect) for effect in others.values())]
+        base = ModelState(studied.effects, (Timing(),))
+        with_one = [base.add(one).weaken([one.id], size) for one in others.values() for size in _SIZES]
+        models = [one.effects for one in (base, *with_one)]
         whole = chosen = _choose(assessment, questions, seconds, time_s - LEAD_S - _TAIL_S)
         while True:
             answers = _foretell(assessment, questions, seconds, chosen)
@@ -404,11 +409,13 @@ def ask(studied: Studied, rehearsal: Rehearsal, others: Sequence[str], known: Fl
             questions.append(
                 Question(text, (number.effect,), "interval", goal, now, number.unit, value, rows)
             )
-    hidden = [name for name in others if not any(name in group for group in groups)]
-    return questions + [
-        Question(f"whether {name} acts", (name,), "presence", DECIDED_T, rows=((*base, row_of[name]),))
-        for name in hidden
-    ]
+    for name, row in row_of.items():
+        if not any(name in group for group in groups):
+            # It is seen where none of those that resemble it can take its place.
+            rivals = (row_of[one] for one in find_effect(name).confused_with if one in row_of and one != name)
+            rows = ((*base, *rivals, row),)
+            questions.append(Question(f"whether {name} acts", (name,), "presence", DECIDED_T, rows=rows))
+    return questions
 
 
 def _choose(
