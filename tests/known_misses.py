@@ -12,8 +12,6 @@ MISSES = {
     "tests/estimation/test_diagnosis.py::"
     "test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a_model_file":
         "the errors of the pasted file differ from those promised by 1 %",
-    "tests/datasets/test_fleet_plan.py::test_what_the_fleet_knows_adds_to_what_a_run_says":
-        "what the fleet knows is not tied to a run that shows nothing of the track: 1.93 for 1.5",
     "tests/estimation/test_diagnosis_search.py::"
     "test_a_dead_time_and_a_limited_torque_take_the_place_of_a_lag_and_a_ramp":
         "a lag and a limited acceleration are named for a dead time and a limited torque",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
@@ -14,7 +15,6 @@ from pipeline import estimation, sources
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
-    All,
     Choices,
     Results,
     build_options,
@@ -30,7 +30,6 @@ from pipeline.core import SlipError, align_rows, format_count, format_duration
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
-    from pipeline.datasets import Expected
     from pipeline.plan import Plan
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
@@ -42,44 +41,36 @@ def plan(  # noqa: D417 - the runs document themselves
     /,
     *,
     vehicle: str | None = None,
-    wanted: Annotated[list[str] | None, Parameter(name="--for")] = None,
     time: str = "60s",
     area: str = "20x10m",
     max_speed: PositiveFloat | None = None,
     max_yaw_rate: PositiveFloat | None = None,
     max_acceleration: PositiveFloat | None = None,
-    max_lateral: PositiveFloat | None = None,
     topic: str | None = None,
     type_name: Annotated[str | None, Parameter(name="--type")] = None,
-    terrain: str | None = None,
     check: Path | None = None,
     config: Path | None = None,
     results: Results = Path("results"),
     folder: Path = Path("plan"),
-    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Plan the drive that tells most of what your logs left open.
 
-    The screen lists what is open and what the drive tells of it; an MCAP file plays it.
+    The drive is the shortest list of five standard manoeuvres that decides most; an MCAP file plays it.
 
     Args:
         vehicle: vehicle preset; without logs the plan covers all effects of that vehicle.
-        terrain: terrain to drive on; the plan starts from what the runs in the results predict there.
-        wanted: ids of effects: only what is open about these.
         time: longest duration, for example 60s or 2min.
         area: free area: length along the initial heading, and width; the start is in its middle.
-        max_speed: highest speed [m/s] (default of all limits: what the runs reached).
+        max_speed: highest speed [m/s] (default, as of the yaw rate: what the runs commanded).
         max_yaw_rate: highest yaw rate [rad/s].
         max_acceleration: highest acceleration [m/s^2].
-        max_lateral: highest acceleration sideways, speed times yaw rate [m/s^2].
         topic: topic of the commands (default: the recorded one).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log of the drive.
         config: configuration file of the logs.
         folder: folder of the plan, to write.
-        everything: also print what the drive does not answer, and what would.
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
@@ -89,50 +80,36 @@ def plan(  # noqa: D417 - the runs document themselves
     names = list(runs or [])
     if check is not None:
         return _check(check, names, options, said, json=json, quiet=quiet)
-    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.plan import Wish, expect, parse_area, parse_time, plan_drive, study  # noqa: PLC0415 - heavy
+    from pipeline import plan as planning  # noqa: PLC0415 - heavy
     from pipeline.report.drive_pages import write_drive  # noqa: PLC0415 - heavy
 
-    seconds = parse_time(time)
+    seconds = planning.parse_time(time)
     gathered = _gather(names, options, quiet=quiet or json) if names else None
     chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
-    recordings = [] if gathered is None else gathered.recordings
     # Report wrong options before a long diagnosis.
-    wish = Wish(
-        parse_area(area, chosen),
-        seconds,
-        tuple(wanted or ()),
-        max_speed,
-        max_yaw_rate,
-        max_acceleration,
-        topic,
-        type_name,
-        max_lateral,
-    )
-    for name in wish.wanted:
-        find_effect(name)
+    ground = planning.parse_area(area, chosen)
     with show_progress(at_work, quiet=quiet or json) as progress:
         progress("diagnosis")
-        if gathered is None:
-            studied = expect(chosen, terrain, results)
-        else:
-            studied = study(recordings, chosen, terrain, results, progress)
-        command = {} if gathered is None else gathered.command
-        made = plan_drive(chosen, studied, wish, recordings, command, progress)
+        studied, first = planning.Studied(chosen), None
+        if gathered is not None:
+            studied = planning.study(gathered.recordings, chosen, progress)
+            first = gathered.manifests[0]
+        limits = planning.choose_limits(
+            chosen,
+            studied.largest,
+            speed_mps=max_speed,
+            yaw_rate_radps=max_yaw_rate,
+            acceleration_mps2=max_acceleration,
+        )
+        usual = planning.choose_topic(chosen, first)
+        played = (topic or usual[0], type_name or usual[1])
+        made = planning.make_plan(studied, limits, ground, seconds, played, progress)
     files = write_drive(made, folder, results)
     shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
     if json:
-        written = {**_known_as_json(studied.expected), "files": [str(file) for file in files], "errors": []}
-        print_json({**made.to_json(), **written})
+        print_json({**made.to_json(), "files": [str(file) for file in files], "errors": []})
     elif not quiet:
-        driven_s = studied.knowledge.driven_s
-        print_lines(
-            [
-                *_format_known(studied.expected),
-                *format_plan(made, driven_s, files, said, wanted or (), everything=everything),
-                *shown,
-            ]
-        )
+        print_lines([*format_plan(made, studied.driven_s, files, said), *shown])
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
 
@@ -151,28 +128,12 @@ def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) ->
     return [f"report       {shown} shows it"] if shown is not None else []
 
 
-def _known_as_json(expected: Expected | None) -> dict[str, object]:
-    if expected is None:
-        return {}
-    there = {"terrain": expected.terrain, "runs_on_terrain": len(expected.here)}
-    return {"known": {**there, "runs_elsewhere": len(expected.elsewhere)}}
-
-
-def _format_known(expected: Expected | None) -> list[str]:
-    if expected is None:
-        return []
-    here = f"{format_count(len(expected.here), 'run')} there"
-    runs = f"{here}, {len(expected.elsewhere)} elsewhere"
-    return [f"known        of {expected.vehicle} on {expected.terrain}: {runs}"]
-
-
 class _Gathered(NamedTuple):
-    """Runs of one vehicle, how the command of the first of them was chosen, and whether one had losses."""
+    """Runs of one vehicle, and whether one had losses."""
 
     vehicle: sources.Vehicle
     recordings: list[estimation.Recording]
     manifests: list[Manifest]
-    command: dict[str, object]
     lossy: bool
 
 
@@ -181,17 +142,14 @@ def _gather(
 ) -> _Gathered:
     """Runs of one vehicle, each once, after those that are known already."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan import read_command  # noqa: PLC0415 - heavy
 
     recordings = [] if known is None else [*known.recordings]
     manifests = [] if known is None else [*known.manifests]
     vehicles = [] if known is None else [known.vehicle] * len(recordings)
-    chosen = {} if known is None else known.command
     lossy = known is not None and known.lossy
     for name in names:
         with open_shown(name, options, quiet=quiet) as opened:
             vehicle, recording = read_recording(opened.manifest)
-            chosen = chosen or read_command(opened.manifest)
         lossy |= opened.lossy
         if recording.sha256 and any(recording.sha256 == known.sha256 for known in recordings):
             continue
@@ -204,7 +162,7 @@ def _gather(
         what = f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one"
         where = ", ".join(recording.name for recording in recordings)
         raise SlipError("several_vehicles", what, where=where, hint="Give runs of one vehicle.")
-    return _Gathered(vehicles[0], recordings, manifests, chosen, lossy)
+    return _Gathered(vehicles[0], recordings, manifests, lossy)
 
 
 def _find_vehicle(name: str | None) -> sources.Vehicle:
@@ -231,7 +189,7 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
         what = f"the plan is for {stored.vehicle}, and the log is of {drive.vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
-    vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
+    vehicle, recordings, _, lossy = _gather(before, options, quiet=quiet, known=drive)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
         driven = [estimation.load_recording(recording, vehicle) for recording in drive.recordings]
@@ -240,65 +198,45 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     checked = check_plan(stored, diagnosis)
     following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
     if json:
-        print_json({**checked.to_json(), "next": following if diagnosis.undecided else None, "errors": []})
+        following_up = following if diagnosis.undecided else None
+        print_json({"kept": checked.outcomes, "open": checked.open, "next": following_up, "errors": []})
     elif not quiet:
         rows = [
-            f"{'met' if one.is_met else 'NOT MET':<9} {one.question}: expected {one.expected}, {one.measured}"
-            for one in checked.answers
+            f"{'kept' if one['kept'] else 'NOT KEPT':<9} {one['question']}: "
+            f"promised {one['promised']}, {one['measured']}"
+            for one in checked.outcomes
         ]
         rows += [f"open      {text}" for text in checked.open]
-        rows = rows or ["the plan has no expected results"]
+        rows = rows or ["the plan promised nothing"]
         print_lines([*rows, f"next      {following}"] if diagnosis.undecided else rows)
     return LOSSY if lossy else CLEAN
 
 
-_GAINS = 5
-"""Rows of what a drive tells on a screen of 24 lines, in the order of the plan."""
-
-
-def format_plan(
-    made: Plan,
-    driven_s: float,
-    files: Sequence[Path],
-    said: str = "",
-    wanted: Sequence[str] = (),
-    *,
-    everything: bool = False,
-) -> list[str]:
-    """The plan on one screen.
+def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = "") -> list[str]:
+    """The plan on one screen, what it will decide first.
 
     Args:
         made: the plan.
         driven_s: length of the logs so far [s]; 0 without logs.
         files: the files that were written.
         said: flags that the next command needs again.
-        wanted: ids of the effects that were asked for; all that is open without any.
-        everything: all open questions; else the first that the drive tells of.
     """
-    from pipeline.plan import SAFETY, list_gains, summarize_gains  # noqa: PLC0415 - heavy
+    from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
 
-    runs = f" after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
-    if not made.gains:
-        if wanted:
-            return [f"open         nothing about {', '.join(wanted)}{runs}"]
-        return [f"open         nothing{runs}: no cause is undecided, and each number is known well enough"]
+    runs = f"after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
+    if not made.questions:
+        return [f"no open question {runs}: no cause is undecided, and each number is known well enough"]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-    gains = list_gains(made)
-    shown = gains if everything or not made.manoeuvres else gains[:_GAINS]
-    rows = align_rows([("open", "so far", "with this drive"), *shown])
-    lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in rows)]
-    if len(shown) < len(gains):
-        lines.append("  the rest, and what would answer what this drive does not: --all, or the page")
-    most = f"limits       {made.format_limits()}"
+    rows = align_rows([(f"open {runs}".strip(), "so far", "with this drive"), *made.list_rows()])
+    most = f"limits       {made.limits.format(steered=made.steered)}"
     if not made.manoeuvres:
-        return [
-            *lines,
-            f"drive        none on {ground} of level ground tells any of this: no file is written",
-            most,
-        ]
+        nothing = f"no drive on {ground} of level ground answers an open question: no file is written"
+        return [nothing, *(f"  {row}" for row in rows), most]
+    names = [f"{number} x {name}" for name, number in Counter(name for name, _ in made.manoeuvres).items()]
     return [
-        *lines,
-        f"drive        {made.commands.duration_s:.0f} s on {ground}",
+        made.summarize(),
+        *(f"  {row}" for row in rows),
+        f"drive        {made.commands.duration_s:.0f} s on {ground}: {', '.join(names)}",
         f"place        start in the middle, heading along the length; end within {made.home_m:.1f} m of it",
         most,
         f"play         ros2 bag play {files[2]}    # {made.type_name} on {made.topic}",

@@ -1,113 +1,135 @@
-"""A plan: manoeuvres chosen for questions, and what the whole is expected to tell of each."""
+"""A plan: the shortest list of standard manoeuvres that decides most of what the runs so far leave open.
 
-import bisect
+The information of a drive is that of its manoeuvres, added to that of the runs. With that on an effect which
+remains beside all else that is not known, s, its t is sqrt(s) / 2 (half, as the diagnosis tests blocks), and
+a number's 95 % interval follows from 1 / sqrt(s).
+"""
+
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
-import msgspec
 import numpy as np
+from scipy.special import chdtri, stdtrit
 
-from pipeline.core import Complex, Floats, enumerate_texts, finite_or_none, format_digits, pick
-from pipeline.estimation.terms import SUGGESTION
-from pipeline.models import Effect, Excitation, Largest, list_effects
-from pipeline.plan.chooser import Chooser, Shape
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    NORMAL_95,
+    Complex,
+    Floats,
+    Ints,
+    finite_or_none,
+    format_digits,
+    format_duration,
+    format_share,
+    name_first,
+    pick,
+    suffix_unit,
+)
+from pipeline.estimation import ModelState
+from pipeline.estimation.driving_need import find_goal
+from pipeline.models import Effect, Timing, find_effect, list_effects, name_number, name_term
 from pipeline.plan.manoeuvres import (
-    LEAD_S,
     LONGEST_S,
-    RATE_HZ,
-    TAIL_S,
     Area,
     Commands,
     Limits,
-    Manoeuvre,
     PlanError,
     is_steered,
     join,
     list_manoeuvres,
     wait,
 )
-from pipeline.plan.questions import (
-    DECIDED_T,
-    Answerable,
-    Judge,
-    Question,
-    Separation,
-    list_concerned,
-)
-from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
+from pipeline.plan.rehearsal import Rehearsal, Studied
+from pipeline.words import suggest_drive
 
-_MODELS = 12
-# Sizes of effects that may act unnoticed, as multiples of the usual one: the largest is not always farthest.
+# Sizes of effects that may act unnoticed, as multiples of the usual ones, for the area of a drive.
 _SIZES = (0.7, 1.0, 1.5, 2.0)
-_STEP_S = 1.0
-# Factors on the goals of single manoeuvres, raised until the whole plan reaches its goals.
-_RESERVES = (1.1, 1.4, 1.8)
+DECIDED_T = 5.0
+"""Expected t of what a drive decides: the diagnosis decides at 1.6, and t scatters by one between drives."""
+LEAD_S = 3.0
+"""Zero commands before the first motion [s]."""
+_TAIL_S = 1.0
+# Length of the blocks from whose differences the diagnosis finds intervals [s].
+_BLOCK_S = 7.0
+# Largest expected half-width, relative to that so far, that counts as narrower.
+_NARROWER = 0.9
+# How often a list of manoeuvres is repeated at most: more is another drive.
+_MOST_ROUNDS = 8
+# Shares of the largest speed that are tried until the drive stays inside the area.
+_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
 
 SAFETY = (
     "This drives a real robot in open loop: no obstacle and no error stops it.",
     "Play it with the wheels lifted first. Then clear the area, and keep an emergency stop at hand.",
     f"It begins with {LEAD_S:g} s of zero commands and obeys the limits that it states.",
 )
+Row = tuple[str, str, str]
+"""A question, what the runs so far say of it, and what the drive adds."""
 
 
 @dataclass(frozen=True)
-class ExpectedGain:
-    """What a drive is expected to tell of one open question.
+class Question:
+    """What the runs leave open, and what a drive is expected to tell of it.
 
     Attributes:
         question: as text.
         effects: ids of the effects concerned.
-        kind: `separation` by a block t, `presence` by one in favour of an effect that acts, or `interval` by
-            the half-width of a 95 % interval.
-        goal: the t, or the half-width, that answers the question.
-        now: t, or half-width in the parameter's unit, before the drive.
-        expected: t, or half-width, of the logs and the drive.
-        decided_after_s: time in the drive from which the question is answered; infinite if it is not.
-        drives: how many times the drive answers it together; 0 if that takes more than an hour of driving.
-        unit: of an interval.
-        value: of the parameter of an interval.
-        needs: what would answer it where this drive does not.
+        kind: `separation`, which of several effects acts; `presence`, whether one acts; or `interval`.
+        goal: the t, or the half-width of a 95 % interval, that decides it.
+        now: half-width so far; 0 for a t.
+        unit, value: of the number of an interval.
+        rows: for each thing that is to be known, its row in the information, last, and of what is not known.
+        expected: t of the drive, or half-width of the runs and the drive together.
+        at_most: half-width that 19 of 20 drives reach: the spread of few blocks scatters.
+        decided_after_s: time in the drive from which it is decided; infinite if it is not.
+        needs: what would decide it where this drive adds nothing.
     """
 
     question: str
     effects: tuple[str, ...]
     kind: Literal["separation", "presence", "interval"]
     goal: float
-    now: float
-    expected: float
-    decided_after_s: float
-    drives: int
+    now: float = 0.0
     unit: str = "1"
     value: float = math.nan
+    rows: tuple[tuple[int, ...], ...] = field(default=(), repr=False)
+    expected: float = math.nan
+    at_most: float = math.nan
+    decided_after_s: float = math.inf
     needs: str = ""
 
     @property
     def informs(self) -> bool:
-        """Whether the drive tells something: repeated it answers the question, or it narrows the interval."""
-        narrows = self.kind == "interval" and format_digits(self.expected) != format_digits(self.now)
-        return self.drives > 0 or (narrows and self.expected < self.now)
+        """Whether the drive decides it, or narrows its interval."""
+        narrows = self.kind == "interval" and self.expected < _NARROWER * self.now
+        return narrows or math.isfinite(self.decided_after_s)
+
+    @property
+    def name(self) -> str:
+        """The question in words."""
+        if self.kind == "interval":
+            return name_number(self.effects[0], self.question.partition(" ")[0].rpartition(".")[2])
+        return " or ".join(name_term(name) for name in self.effects)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Commands and their expected gain.
+    """Commands and what they are expected to tell.
 
     Attributes:
         vehicle: id of the vehicle.
-        runs: names of the logs that the plan is based on.
+        runs: names of the runs that the plan is based on.
         manoeuvres: names and start times [s].
         commands: all of them, zero commands first.
         limits, area: limits that it satisfies.
-        gains: what is expected by question; what is answered first stands first.
+        questions: all that is open; what is decided first stands first.
         topic, type_name: topic on which the commands are played, and its type.
         steered: whether a turn is a steering angle.
-        home_m: largest distance of any model's end from the start.
-        wheels: commanded speeds of the left and the right wheels [rad/s], shape (n,) each; None if the drive
-            has other inputs.
-        ways: paths of the models, base first, positions x + iy [m] at 20 Hz, shape (models, n).
-        as_driven: limits that are what the runs reached, in words.
+        ways: paths of the known model, first, and of those with one effect more, positions x + iy [m] at
+            20 Hz, shape (models, n).
     """
 
     vehicle: str
@@ -116,361 +138,322 @@ class Plan:
     commands: Commands = field(repr=False)
     limits: Limits
     area: Area
-    gains: tuple[ExpectedGain, ...]
+    questions: tuple[Question, ...]
     topic: str
     type_name: str
     steered: bool
-    home_m: float
-    wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
-    as_driven: tuple[str, ...] = ()
 
     @property
-    def informative(self) -> tuple[ExpectedGain, ...]:
+    def informative(self) -> tuple[Question, ...]:
         """Questions of which the drive tells something."""
-        return tuple(one for one in self.gains if one.informs)
+        return tuple(one for one in self.questions if one.informs)
 
     @property
-    def unanswered(self) -> tuple[ExpectedGain, ...]:
-        """Questions of which it tells nothing."""
-        return tuple(one for one in self.gains if not one.informs)
+    def decided(self) -> tuple[Question, ...]:
+        """Questions that the drive decides."""
+        return tuple(one for one in self.questions if math.isfinite(one.decided_after_s))
 
-    def format_limits(self) -> str:
-        """All limits, and which of them are what the runs reached."""
-        text = self.limits.format(steered=self.steered)
-        return f"{text} ({enumerate_texts(self.as_driven)} as the runs reached)" if self.as_driven else text
+    @property
+    def home_m(self) -> float:
+        """Largest distance of any model's end from the start."""
+        return float(np.abs(self.ways[:, -1]).max())
+
+    def summarize(self) -> str:
+        """What the drive decides of all that is open."""
+        decided = self.decided
+        parts = [f"decides {len(decided)} of {len(self.questions)} open questions"]
+        if decided:
+            parts[0] += f" in {format_duration(self.commands.duration_s)}: " + name_first(
+                dict.fromkeys(one.name for one in decided)
+            )
+        if narrowed := len(self.informative) - len(decided):
+            parts.append(f"narrows {narrowed}")
+        return "; ".join(parts)
+
+    def list_rows(self) -> list[Row]:
+        """The open questions: those that the drive decides, in their order, then the others."""
+        rows = []
+        for one in self.informative:
+            is_decided = math.isfinite(one.decided_after_s)
+            after = f"after {format_duration(one.decided_after_s)}" if is_decided else ""
+            if one.kind == "separation":
+                rows.append((one.name, "undecided", f"decided {after}"))
+            elif one.kind == "interval":
+                unit = suffix_unit(one.unit)
+                text = f"±{format_digits(one.expected)}{unit}"
+                text += f"; ±{format_digits(one.goal)} {after}" if after else ""
+                rows.append((one.name, f"{one.value:.3g} ±{format_digits(one.now)}{unit}", text))
+        seen = [one for one in self.informative if one.kind == "presence"]
+        if seen:
+            after = f"seen after {format_duration(seen[-1].decided_after_s)}, if acting"
+            rows.append((name_first([one.name for one in seen]), "not seen", after))
+        rest = [one for one in self.questions if not one.informs]
+        for needs in dict.fromkeys(one.needs for one in rest):
+            names = name_first(dict.fromkeys(one.name for one in rest if one.needs == needs))
+            rows.append((names, "not by this drive", needs))
+        return rows
 
     def to_json(self) -> dict[str, object]:
         """The documented keys of `slip plan --json`, and others."""
         return {
             "duration_s": self.commands.duration_s if self.manoeuvres else 0.0,
-            "vehicle": self.vehicle,
+            **pick(self, "vehicle", "home_m", "topic"),
+            "type": self.type_name,
             "runs": list(self.runs),
-            "home_m": self.home_m,
             "limits": asdict(self.limits) | {"yaw_rate_radps": finite_or_none(self.limits.yaw_rate_radps)},
-            "limits_as_driven": list(self.as_driven),
             "area": asdict(self.area),
             "safety": list(SAFETY),
-            "topic": self.topic,
-            "type": self.type_name,
             "manoeuvres": [{"name": name, "start_s": start} for name, start in self.manoeuvres],
             "promises": [
                 {
-                    **pick(one, "question", "kind", "goal", "drives", "unit"),
+                    **pick(one, "question", "kind", "goal", "now", "unit"),
                     "effects": list(one.effects),
                     "decided_after_s": finite_or_none(one.decided_after_s),
-                    "now": finite_or_none(one.now),
                     ("interval_after_s" if one.kind == "interval" else "expected_t"): one.expected,
                 }
                 for one in self.informative
             ],
             "impossible": [
                 {"question": one.question, "effects": list(one.effects), "because": one.needs}
-                for one in self.unanswered
+                for one in self.questions
+                if not one.informs
             ],
         }
 
 
-@dataclass(frozen=True)
-class Request:
-    """Request for a plan.
+class Assessment:
+    """What a drive of manoeuvres is expected to tell of questions.
 
-    Attributes:
-        limits, area: to obey.
-        time_s: longest duration, including the zero commands at the start.
-        runs: names of the logs that the knowledge is based on.
-        topic, type_name: topic on which the commands will be played, and its type.
-        as_driven: limits that are what the runs reached, in words.
+    Args:
+        prior: information before the drive, shape (q, q).
+        blocks: information of each block of the manoeuvres, one after the other, shape (k, q, q).
+        owner: number of the manoeuvre of each block, shape (k,).
+        before_s: length of the runs so far [s].
     """
 
-    limits: Limits
-    area: Area
-    time_s: float
-    runs: tuple[str, ...] = ()
-    topic: str = "/cmd_vel"
-    type_name: str = "geometry_msgs/msg/Twist"
-    as_driven: tuple[str, ...] = ()
+    def __init__(self, prior: Floats, blocks: Floats, owner: Ints, before_s: float) -> None:
+        self.prior, self._blocks, self._owner = prior, blocks, owner
+        self._before = before_s / _BLOCK_S
+
+    def expect(self, one: Question, counts: Floats) -> tuple[Question, float]:
+        """A question with what is expected, and the share of its goal that is reached, 1 if it is decided.
+
+        Args:
+            one: the question.
+            counts: how often each manoeuvre is driven, shape (manoeuvres,).
+        """
+        weight = counts[self._owner]
+        strength = find_strength(self.prior + np.tensordot(weight, self._blocks, 1), one.rows)
+        known, number = find_strength(self.prior, one.rows), one.rows[0][-1]
+        carrying = self._count_blocks(number, weight)
+        if one.kind != "interval":
+            t = 0.5 * math.sqrt(max(strength - known, 0.0))
+            share = min((t / one.goal) ** 2, 1.0) * min(carrying / FEWEST_OF_SPREAD, 1.0)
+            return replace(one, expected=t), share
+        freedom = max(carrying - 1.0, 1.0)
+        half = stdtrit(freedom, 0.975) / math.sqrt(strength)
+        if self._before:
+            # What the diagnosis states may be wider than noise alone explains.
+            before = max(self._count_blocks(number, 0.0 * weight) - 1.0, 1.0)
+            half *= max(one.now * math.sqrt(known) / stdtrit(before, 0.975), 1.0)
+        most = half * math.sqrt(chdtri(freedom, 0.05) / freedom)
+        return replace(one, expected=float(half), at_most=float(most)), min((one.goal / most) ** 2, 1.0)
+
+    def _count_blocks(self, number: int, weight: Floats) -> float:
+        """Blocks of the runs and of the drive that carry the information on a number."""
+        shown, known = self._blocks[:, number, number], self.prior[number, number] if self._before else 0.0
+        squares = weight @ shown**2 + known**2 / (self._before or 1.0)
+        return float((weight @ shown + known) ** 2 / squares) if squares > 0.0 else 1.0
+
+
+def find_strength(information: Floats, rows: Sequence[Sequence[int]]) -> float:
+    """Least information on the last of each of these rows that remains beside the others."""
+    return min(1.0 / float(np.linalg.inv(information[np.ix_(one, one)])[-1, -1]) for one in rows)
 
 
 def make_plan(
-    knowledge: Knowledge,
-    questions: Sequence[Question],
-    request: Request,
+    studied: Studied,
+    limits: Limits,
+    area: Area,
+    time_s: float,
+    played: tuple[str, str],
     notify: Callable[[str], object] = str,
 ) -> Plan:
-    """Choose the manoeuvres that tell most of the questions, and compute what the whole tells of each.
+    """Choose the shortest list of manoeuvres that decides most of what is open, repeated where that helps.
 
     Args:
-        knowledge: what is known before the drive.
-        questions: to answer.
-        request: time, area and limits.
+        studied: what is known of the vehicle.
+        limits: that no command exceeds.
+        area: that no model leaves.
+        time_s: longest duration, including the zero commands at the start.
+        played: topic and message type of the commands.
         notify: called with what is being done.
 
     Raises:
-        PlanError: ``no_room``, no manoeuvre fits into the area and the time.
+        PlanError: ``no_room``, no manoeuvre fits into the area.
     """
-    largest = find_largest(knowledge, request.limits, request.time_s)
-    models = _list_models(knowledge, questions, largest)
-    library = list_manoeuvres(knowledge.vehicle, request.limits)
-    best = _rehearse(knowledge, questions, request.area, [], models)
-    if questions:
-        plural = "s" * (len(questions) != 1)
-        notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open question{plural}")
-        chooser = _make_chooser(knowledge, questions, request, models)
-        undriven = tuple(_expect_gain(one, np.zeros(len(library))) for one in chooser.questions)
-        best = replace(best, gains=undriven)
-        for attempt, reserve in enumerate(_RESERVES, start=1):
-            notify(f"choosing manoeuvres, attempt {attempt} of at most {len(_RESERVES)}")
-            chosen = [library[number] for number in chooser.choose(reserve)]
-            trial = _rehearse(knowledge, questions, request.area, chosen, models)
-            # What tells nothing is not driven.
-            if trial.answered <= best.answered or not any(one.informs for one in trial.gains):
+    best: Plan | None = None
+    for scale in _SCALES:
+        notify(f"manoeuvres at {format_share(scale)} of the largest speed")
+        library = list_manoeuvres(studied.vehicle, limits, scale)
+        names, seconds = [*library], np.array([one.duration_s for one in library.values()])
+        ends = np.cumsum(seconds)
+        rehearsal = Rehearsal(join([*library.values()]), studied, ends - seconds)
+        cuts = [
+            np.append(np.arange(end - length + _BLOCK_S, end - 0.5 * _BLOCK_S, _BLOCK_S), end)
+            for length, end in zip(seconds, ends, strict=True)
+        ]
+        owner = np.repeat(np.arange(seconds.size), [cut.size for cut in cuts])
+        others = list_others(studied, rehearsal, time_s)
+        known = rehearsal.recall(len(others))
+        blocks = rehearsal.inform([*others.values()], np.concatenate(cuts))
+        assessment = Assessment(known, blocks, owner, studied.driven_s)
+        questions = ask(studied, rehearsal, [*others], known)
+        base = ModelState(studied.effects, (Timing(),))
+        with_one = [base.add(one).weaken([one.id], size) for one in others.values() for size in _SIZES]
+        models = [one.effects for one in (base, *with_one)]
+        whole = chosen = _choose(assessment, questions, seconds, time_s - LEAD_S - _TAIL_S)
+        while True:
+            answers = _foretell(assessment, questions, seconds, chosen)
+            if not any(one.informs for one in answers):
+                # What tells nothing is not driven, wherever it fits.
+                whole, chosen = () if chosen == whole else whole, ()
+            commands = join([wait(LEAD_S), *(library[names[one]] for one in chosen), wait(_TAIL_S)])
+            starts = LEAD_S + np.cumsum([0.0, *seconds[[*chosen]]])
+            driven = Rehearsal(commands, studied, starts)
+            ways = np.array([driven.trace(effects)[0] for effects in models])
+            if not chosen or area.holds(ways):
                 break
-            best = trial
-            if all(math.isfinite(one.decided_after_s) for one in best.gains if one.informs):
+            chosen = chosen[:-1]
+        made = Plan(
+            studied.vehicle.id,
+            tuple(run.name for run in studied.runs),
+            tuple(zip((names[one] for one in chosen), starts[:-1].round(3).tolist(), strict=True)),
+            commands,
+            limits,
+            area,
+            tuple(answers),
+            *played,
+            is_steered(studied.vehicle),
+            ways,
+        )
+        if best is None or len(made.decided) > len(best.decided):
+            best = made
+        if chosen == whole:
+            return best
+    if best is None or not best.manoeuvres:
+        what, where = "no drive fits into the area", f"{area.length_m:g} x {area.width_m:g} m"
+        raise PlanError("no_room", what, where=where, hint="Give a larger --area, or a lower --max-speed.")
+    return best
+
+
+def list_others(studied: Studied, rehearsal: Rehearsal, time_s: float) -> dict[str, Effect]:
+    """Effects that may act beside the known ones: undecided ones as fitted, others at their usual sizes.
+
+    Args:
+        studied: what is known; without runs, every effect of the vehicle's kind may act.
+        rehearsal: commands, to whose largest the usual sizes of limits are relative.
+        time_s: length of a plan, in which a usual change happens.
+    """
+    largest = replace(rehearsal.data.largest, turns=None)
+    largest = replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size))
+    known = {effect.id for effect in studied.effects}
+    others: dict[str, Effect] = {}
+    for group in () if studied.diagnosis is None else studied.diagnosis.undecided:
+        for name in group.candidates:
+            fitted = {key: one.value for key, one in group.parameters.get(name, {}).items()}
+            others.setdefault(name, find_effect(name)().make_usual(largest).change_within(**fitted))
+    kinds = [effect for effect in list_effects() if studied.vehicle.kind in effect.kinds]
+    hidden = {one.id for one in kinds} if studied.diagnosis is None else studied.diagnosis.unobservable_why
+    for effect in kinds:
+        if effect.id in hidden and effect.id not in known and effect.acts_in(known):
+            others.setdefault(effect.id, effect().make_usual(largest))
+    return others
+
+
+def ask(studied: Studied, rehearsal: Rehearsal, others: Sequence[str], known: Floats) -> list[Question]:
+    """What the runs leave open: undecided effects, wide intervals, and effects that they could not show.
+
+    Args:
+        studied: what is known.
+        rehearsal: commands; its numbers, and then the other effects, are the rows of the information.
+        others: ids of the other effects.
+        known: information before the drive.
+    """
+    numbers = rehearsal.numbers
+    base, row_of = tuple(range(len(numbers))), {name: len(numbers) + at for at, name in enumerate(others)}
+    diagnosis = studied.diagnosis
+    groups = () if diagnosis is None else tuple(group.candidates for group in diagnosis.undecided)
+    questions = [
+        Question(
+            " or ".join(group), group, "separation", DECIDED_T,
+            rows=tuple((*base, row_of[b], row_of[a]) for a, b in itertools.permutations(group, 2)),
+        )
+        for group in groups
+    ]  # fmt: skip
+    stated = {
+        f"{effect.id}.{name}": value.half
+        for effect in (() if diagnosis is None else diagnosis.effects)
+        for name, value in effect.parameters.items()
+        if math.isfinite(value.half)
+    }
+    values = {effect.id: effect.values for effect in studied.effects}
+    for row, number in enumerate(numbers):
+        rows = ((*base[:row], *base[row + 1 :], row),)
+        value = values[number.effect][number.name]
+        goal = find_goal(number.effect, number.name, value)
+        now = stated.get(number.label, NORMAL_95 / math.sqrt(find_strength(known, rows)))
+        if now > goal:
+            text = f"{number.label} within {goal:.2g}{suffix_unit(number.unit)}"
+            questions.append(
+                Question(text, (number.effect,), "interval", goal, now, number.unit, value, rows)
+            )
+    for name, row in row_of.items():
+        if not any(name in group for group in groups):
+            # It is seen where none of those that resemble it can take its place.
+            rivals = (row_of[one] for one in find_effect(name).confused_with if one in row_of and one != name)
+            rows = ((*base, *rivals, row),)
+            questions.append(Question(f"whether {name} acts", (name,), "presence", DECIDED_T, rows=rows))
+    return questions
+
+
+def _choose(
+    assessment: Assessment, questions: Sequence[Question], seconds: Floats, time_s: float
+) -> tuple[int, ...]:
+    """Manoeuvres of the shortest drive that decides most, by number; none where the time is too short."""
+    best, chosen = (0, 0.0, 0.0), tuple[int, ...]()
+    sizes = range(1, seconds.size + 1)
+    for one in itertools.chain.from_iterable(itertools.combinations(range(seconds.size), n) for n in sizes):
+        length = float(seconds[[*one]].sum())
+        for rounds in range(1, min(int(time_s / length), _MOST_ROUNDS) + 1):
+            counts = np.bincount(one * rounds, minlength=seconds.size).astype(np.float64)
+            shares = [assessment.expect(question, counts)[1] for question in questions]
+            decided = sum(share >= 1.0 for share in shares)
+            rank = (decided, round(sum(shares), 1), -length * rounds)
+            if rank > best:
+                best, chosen = rank, one * rounds
+            if decided == len(questions):
                 break
-        notify("what other drives would add")
-        best = replace(best, gains=_advise(best, chooser, knowledge, questions, request.limits))
-    commands, ways = best.commands, best.ways
-    return Plan(
-        as_driven=request.as_driven,
-        vehicle=knowledge.vehicle.id,
-        runs=request.runs,
-        manoeuvres=tuple((one.name, at) for one, at in zip(best.manoeuvres, best.starts, strict=True)),
-        commands=commands,
-        limits=request.limits,
-        area=request.area,
-        gains=best.gains,
-        topic=request.topic,
-        type_name=request.type_name,
-        steered=is_steered(knowledge.vehicle),
-        home_m=float(np.abs(ways[:, -1]).max()),
-        wheels=_turn_wheels(commands, knowledge),
-        ways=ways,
-    )
+    return chosen
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """Manoeuvres rehearsed as a whole; see `Plan`."""
-
-    manoeuvres: tuple[Manoeuvre, ...]
-    starts: tuple[float, ...]
-    commands: Commands
-    ways: Complex
-    gains: tuple[ExpectedGain, ...]
-    answered: float
-
-
-def _advise(
-    best: _Trial, chooser: Chooser, knowledge: Knowledge, questions: Sequence[Question], limits: Limits
-) -> tuple[ExpectedGain, ...]:
-    """What is expected, with what would tell the questions of which the drive tells nothing.
-
-    An hour of all manoeuvres that fit into the area, of all manoeuvres, and of all at higher limits.
-    """
-    unanswered = {one.question for one in best.gains if not one.informs}
-    room = np.array([chooser.fits([number]) for number in range(chooser.durations.size)], dtype=np.float64)
-    needs = dict[str, str]()
-    for one in chooser.questions:
-        question = one.question
-        if question.text not in unanswered:
-            continue
-        if any(Excitation.SLOPE in effect.needs for effect in list_concerned(question)):
-            needs[question.text] = "drive by hand on a slope, in several directions"
-        elif _answers(one, room):
-            is_alone = len(best.gains) == 1 or SUGGESTION in question.effects
-            alone = f"needs a drive of its own: slip plan --for {question.effects[0]}"
-            needs[question.text] = "give more --time" if is_alone else alone
-        elif _answers(one, np.ones(room.size)):
-            needs[question.text] = "give a larger --area"
-    rest = [one for one in questions if one.text in unanswered - needs.keys()]
-    harder, options = limits.raise_within(knowledge.vehicle)
-    for one in _judge_library(knowledge, rest, harder)[1] if rest else ():
-        needs[one.question.text] = (
-            f"give {options}, where the robot and the ground allow it"
-            if _answers(one, np.ones(one.groups.seconds.size))
-            else "no drive that was tried answers it: an hour, anywhere, at the highest limits"
-        )
-    return tuple(replace(one, needs=needs.get(one.question, "")) for one in best.gains)
-
-
-def _answers(one: Answerable, weight: Floats) -> bool:
-    """Whether an hour of these manoeuvres answers a question."""
-    seconds = float(weight @ one.groups.seconds)
-    return seconds > 0.0 and float(one.answer(weight * (LONGEST_S / seconds))) >= 1.0
-
-
-def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:
-    """Wheel commands in the scale of a recorded log."""
-    kinematics = knowledge.vehicle.kinematics
-    if is_steered(knowledge.vehicle) or kinematics.has_inputs("sideways"):
-        return None
-    vehicle = msgspec.structs.replace(knowledge.vehicle, controller_track_multiplier=1.0)
-    driven, senses = drive(commands, vehicle), knowledge.senses
-    ahead = 0.5 * (driven.left + driven.right) / senses.command_scale
-    apart = 0.5 * (driven.right - driven.left) / senses.command_turn_scale
-    return ahead - apart, ahead + apart
-
-
-def _rehearse(
-    knowledge: Knowledge,
-    questions: Sequence[Question],
-    area: Area,
-    chosen: Sequence[Manoeuvre],
-    models: Sequence[tuple[Effect, ...]],
-) -> _Trial:
-    """Longest beginning of a sequence that stays inside the area, and its expected gain."""
-    chosen = list(chosen)
-    while True:
-        commands = join([wait(LEAD_S), *(one.commands for one in chosen), wait(TAIL_S)])
-        ends = LEAD_S + np.cumsum([0.0, *(one.commands.duration_s for one in chosen)])
-        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, ends)
-        ways = np.array([rehearsal.trace(effects)[0] for effects in models])
-        # Motion that outlasts the rest between two manoeuvres shows only in the whole sequence.
-        if not chosen or area.holds(ways):
-            break
-        chosen.pop()
-    starts = tuple(np.round(ends[:-1], 3).tolist())
-    if not chosen:
-        return _Trial((), (), commands, ways, (), 0.0)
-    gains, answered = _expect_gains(knowledge, questions, rehearsal, commands.duration_s)
-    return _Trial(tuple(chosen), starts, commands, ways, gains, answered)
-
-
-def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest:
-    """Largest commands of plans within these limits; usual sizes of effects are fractions of them."""
-    library = join([one.commands for one in list_manoeuvres(knowledge.vehicle, limits)])
-    largest = Rehearsal(library, knowledge.vehicle, knowledge.senses, np.zeros(1)).largest
-    return replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size), turns=None)
-
-
-def _list_models(
-    knowledge: Knowledge, questions: Sequence[Question], largest: Largest
-) -> list[tuple[Effect, ...]]:
-    """Candidate models: the base, those of the questions, draws, and the base with one more effect.
-
-    A slow or short log may hide any effect: each one of the catalogue is assumed to act at usual sizes.
-    """
-    asked = dict.fromkeys(
-        model
-        for question in questions
-        for model in (question.models if isinstance(question, Separation) else (question.model,))
-    )
-    supposed = list(dict.fromkeys([knowledge.base, *asked]))
-    generator = np.random.default_rng(0)
-    drawn = [supposed[turn % len(supposed)].draw(generator) for turn in range(_MODELS)]
-    unnoticed = dict.fromkeys(
-        _enlarge(one, times)
-        for effect in list_effects()
-        if knowledge.vehicle.kind in effect.kinds and effect.id not in knowledge.base.names
-        for one in (effect().make_usual(largest), _make_typical(effect()))
-        for times in _SIZES
-    )
-    base = start_state(knowledge.base.effects)
-    return [*(model.effects for model in supposed), *drawn, *(base.add(one).effects for one in unnoticed)]
-
-
-def _make_typical(effect: Effect) -> Effect:
-    """An effect of typical size, independent of the plan's commands."""
-    return effect.change(
-        **{p.name: p.typical for p in effect.parameters if not p.instead_of and not p.relative_to}
-    )
-
-
-def _enlarge(effect: Effect, times: float) -> Effect:
-    """Scale an effect's distance from neutral; a limit that is neutral at infinity is divided instead."""
-    values = {}
-    for parameter in effect.parameters:
-        value, neutral = effect.values[parameter.name], parameter.neutral
-        if math.isfinite(value) and not math.isnan(neutral):
-            far = neutral + times * (value - neutral) if math.isfinite(neutral) else value / times
-            values[parameter.name] = min(max(far, parameter.bounds[0]), parameter.bounds[1])
-    return effect.change(**values)
-
-
-def _make_chooser(
-    knowledge: Knowledge,
-    questions: Sequence[Question],
-    request: Request,
-    models: Sequence[tuple[Effect, ...]],
-) -> Chooser:
-    """Chooser for the library, with the information of each manoeuvre on each question, and its paths."""
-    rehearsal, answerable = _judge_library(knowledge, questions, request.limits)
-    durations = answerable[0].groups.seconds
-    edges = np.concatenate(([0.0], np.cumsum(durations)))
-    ways = [rehearsal.trace(effects) for effects in models]
-    shapes = []
-    for begin, end in zip((edges[:-1] * RATE_HZ).round(), (edges[1:] * RATE_HZ).round(), strict=True):
-        rows = slice(int(begin), int(end) + 1)
-        paths = np.array([path[rows] for path, _ in ways])
-        turned = np.array([heading[rows] for _, heading in ways])
-        own = np.exp(-1j * turned[:, :1]) * (paths - paths[:, :1])
-        shapes.append(Shape(own, turned[:, -1] - turned[:, 0]))
-    time_s = request.time_s - LEAD_S - TAIL_S
-    chooser = Chooser(answerable, durations, shapes, request.area, time_s)
-    if not any(chooser.fits([one]) for one in np.flatnonzero(durations <= time_s).tolist()):
-        raise PlanError(
-            "no_room",
-            "no manoeuvre fits into the area and the time",
-            where=f"{request.area.length_m:g} x {request.area.width_m:g} m, {request.time_s:g} s",
-            hint="Give a larger --area or --time, or a lower --max-speed.",
-        )
-    return chooser
-
-
-def _judge_library(
-    knowledge: Knowledge, questions: Sequence[Question], limits: Limits
-) -> tuple[Rehearsal, list[Answerable]]:
-    """All manoeuvres within limits one after the other, and what each tells of every question."""
-    pieces = [one.commands for one in list_manoeuvres(knowledge.vehicle, limits)]
-    edges = np.concatenate(([0.0], np.cumsum([one.duration_s for one in pieces])))
-    rehearsal = Rehearsal(join(pieces), knowledge.vehicle, knowledge.senses, edges[:-1])
-    return rehearsal, Judge(rehearsal, knowledge, edges).judge(questions)
-
-
-def _expect_gains(
-    knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
-) -> tuple[tuple[ExpectedGain, ...], float]:
-    """What the whole plan tells by question, and the sum of the fractions of the goals that it reaches."""
-    edges = np.arange(0.0, duration_s + _STEP_S, _STEP_S)
-    judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
-    whole = np.ones(edges.size - 1)
-    answered = sum(float(one.answer(whole)) for one in judged)
-    gains = []
-    for one in judged:
-        within = _find_first(one, [whole * (edges[1:] <= end) for end in edges])
-        drives = _find_first(one, [whole * count for count in range(int(LONGEST_S / edges[-1]) + 1)])
-        after = math.inf if within is None else float(edges[within])
-        gains.append(replace(_expect_gain(one, whole), decided_after_s=after, drives=drives or 0))
-    return tuple(sorted(gains, key=lambda one: (one.decided_after_s, one.drives))), answered
-
-
-def _expect_gain(one: Answerable, weight: Floats) -> ExpectedGain:
-    """What a drive tells of a question, without when; weights of its groups as of `Answerable.answer`."""
-    question = one.question
-    gain = ExpectedGain(
-        question=question.text,
-        effects=question.effects,
-        kind="separation",
-        goal=DECIDED_T,
-        now=question.now,
-        expected=float(one.measure(weight)),
-        decided_after_s=math.inf,
-        drives=0,
-    )
-    if isinstance(question, Separation):
-        return replace(gain, kind="presence" if question.is_presence else "separation")
-    return replace(
-        gain,
-        kind="interval",
-        goal=question.goal,
-        unit=question.model.free[question.number].unit,
-        value=float(question.model.values[question.number]),
-    )
-
-
-def _find_first(one: Answerable, weights: Sequence[Floats]) -> int | None:
-    """Number of the first of weights that rise which answers a question; None if none does."""
-    number = bisect.bisect_left(weights, 1.0, key=lambda weight: float(one.answer(weight)))
-    return number if number < len(weights) else None
+def _foretell(
+    assessment: Assessment, questions: Sequence[Question], seconds: Floats, chosen: Sequence[int]
+) -> list[Question]:
+    """The questions with what these manoeuvres, one after the other, are expected to tell of each."""
+    answers = []
+    every = np.full(seconds.size, LONGEST_S / float(seconds.sum()))
+    for one in questions:
+        after = math.inf
+        for count in range(1, len(chosen) + 1):
+            counts = np.bincount(chosen[:count], minlength=seconds.size).astype(np.float64)
+            if assessment.expect(one, counts)[1] >= 1.0:
+                after = round(LEAD_S + float(seconds[[*chosen[:count]]].sum()), 3)
+                break
+        counts = np.bincount(np.array(chosen, np.int64), minlength=seconds.size).astype(np.float64)
+        is_slow = assessment.expect(one, every)[1] >= 1.0
+        needs = "give more --time" if is_slow else suggest_drive(*one.effects)
+        expected = assessment.expect(one, counts)[0]
+        answers.append(replace(expected, decided_after_s=after, needs=needs))
+    return sorted(answers, key=lambda one: one.decided_after_s)

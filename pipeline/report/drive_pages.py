@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import PathError, read_bounded_text, resolve_inside
-from pipeline.plan import SAFETY, Plan, list_gains
+from pipeline.plan import SAFETY, Plan
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, set_squares, theme
 from pipeline.report.page import render_figures
 from pipeline.report.theme import (
@@ -56,7 +56,7 @@ def preview_plan(plan: Plan) -> dict[str, object]:
         "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
         "duration_s": plan.commands.duration_s,
         "play": _format_play(plan),
-        "gains": list_gains(plan),
+        "gains": plan.list_rows(),
     }
 
 
@@ -92,7 +92,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
         ],
         safety=SAFETY,
         play=_format_play(plan),
-        rows=list_gains(plan),
+        rows=plan.list_rows(),
         has_intervals=any(one.kind == "interval" for one in plan.informative),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )

@@ -148,12 +148,14 @@ def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable
     Raises:
         SlipError: the run cannot be diagnosed, or no drive fits into the area.
     """
-    from pipeline.plan import Wish, parse_area, parse_time, plan_drive, read_command, study  # noqa: PLC0415
+    from pipeline import plan  # noqa: PLC0415 - heavy
 
     vehicle, recording = read_recording(manifest)
-    wish = Wish(parse_area(area, vehicle), parse_time(_TIME))
-    studied = study([recording], vehicle, notify=notify)
-    made = plan_drive(vehicle, studied, wish, [recording], read_command(manifest), notify)
+    ground, seconds = plan.parse_area(area, vehicle), plan.parse_time(_TIME)
+    studied = plan.study([recording], vehicle, notify)
+    limits = plan.choose_limits(vehicle, studied.largest)
+    played = plan.choose_topic(vehicle, manifest)
+    made = plan.make_plan(studied, limits, ground, seconds, played, notify)
     leave_plan(store, manifest, made)
 
 

@@ -502,7 +502,7 @@ def _format_unobservable(run: RunDiagnosis) -> list[str]:
     others = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
     manoeuvres = dict.fromkeys(part for name in hidden for part in suggest_drive(name).split("; "))
     advice = "; ".join(list(manoeuvres)[:3])
-    # Only a rehearsal shows what a drive reaches within the limits of the site and the robot.
+    # Only a plan shows what a drive reaches within the limits of the site and the robot.
     needs = [kind.needs for kind in list_effects() if kind.id in hidden]
     if any(Excitation.SLOPE not in one for one in needs):
         advice += "; `slip plan` says whether its room and time are enough"
