@@ -10,16 +10,21 @@ from numpy.typing import NDArray
 
 from pipeline.core import Ints, name_first
 from pipeline.logs import records as rec
-from pipeline.logs.catalog import Catalog, Cover
+from pipeline.logs.catalog import Catalog
 from pipeline.logs.chunks import FIRST_PRIVATE
-from pipeline.logs.records import FIRST_BLOCK, LAST_BLOCK, ByteSource, Loss, possible_places
+from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.spans import Loaded, Span, SpanKind
 
 _FIRST_WINDOW: Final = 1 << 12
 _WINDOW: Final = 1 << 18
 _LOOSE_SPAN: Final = 1 << 22
-_KNOWN: Final = tuple(rec.LEAST_BODY)
 _CHAIN: Final = 3
+"""Number of successive records that must be possible; a random position passes one with p < 1e-4."""
+
+_FIRST_BLOCK: Final = 1 << 12
+_LAST_BLOCK: Final = 1 << 20
+"""First and largest block of a search [bytes]: blocks grow, so that dense damage does not make it slow."""
+
 _MAX_SIDE_RECORD: Final = 1 << 26
 
 
@@ -119,16 +124,15 @@ class Scanner:
         if opcode == rec.METADATA:
             name, entries = rec.parse_metadata(body, catalog.extras.most)
             catalog.side_records.add((position, rec.HEAD_SIZE + len(body), name))
-            if (
-                catalog.extras.take(None if entries is None else len(entries), len(body))
-                and entries is not None
-            ):
-                catalog.metadata.append((name, entries))
+            if catalog.extras.take(catalog.extras.most if entries is None else len(entries), len(body)):
+                catalog.metadata.append((name, entries or {}))
             return
         record = rec.parse_record(opcode, body)
         if isinstance(record, Schema | Channel):
-            # Records after the data section belong to the summary, which is rejected when this scan runs.
-            catalog.add_description(record, Cover.DATA if catalog.data_end is None else Cover.SUMMARY)
+            if catalog.data_end is None:
+                catalog.add_description(record, covered=False)
+            else:
+                catalog.repeated.append(record)
         elif isinstance(record, Header):
             catalog.profile, catalog.library = record.profile, record.library
         elif opcode == rec.DATA_END:
@@ -192,16 +196,16 @@ class Scanner:
             self._catalog.spans.append(replace(last, length=position - last.offset))
 
     def _find(self, start: int, stop: int) -> int:
-        low, size = start, FIRST_BLOCK
+        low, size = start, _FIRST_BLOCK
         while low <= stop - rec.HEAD_SIZE:
             block = np.frombuffer(self._source.read_at(low, size + rec.HEAD_SIZE - 1), dtype=np.uint8)
             high = min(block.size, stop - low) - rec.HEAD_SIZE + 1
             if high <= 0:
                 break
-            for inner in possible_places(block, 0, high, stop - low, _KNOWN).tolist():
+            for inner in _possible_places(block, high, stop - low).tolist():
                 if self._goes_on(low + inner, stop):
                     return low + int(inner)
-            low, size = low + high, min(2 * size, LAST_BLOCK)
+            low, size = low + high, min(2 * size, _LAST_BLOCK)
         return stop
 
     def _take_cut_chunk(self, position: int, stop: int) -> bool:
@@ -230,6 +234,18 @@ class Scanner:
             else f"bytes {start} to {end} hold no record"
         )
         self._catalog.losses.append(Loss(kind, text, bytes=end - start, start_ns=self._last_ns))
+
+
+def _possible_places(data: NDArray[np.uint8], high: int, end: int) -> Ints:
+    """Positions below ``high`` whose opcode and length are possible for a record that ends by ``end``."""
+    least = np.full(256, np.iinfo(np.int64).max, dtype=np.int64)
+    least[list(rec.LEAST_BODY)] = list(rec.LEAST_BODY.values())
+    # Most bytes are not an opcode: lengths are checked only after those that may be one.
+    places = np.flatnonzero(data[:high] - np.uint8(1) < np.uint8(len(rec.LEAST_BODY)))
+    heads: NDArray[np.uint64] = np.ndarray((data.size - 8,), "<u8", data, offset=1, strides=(1,))
+    length = heads[places]
+    room = (end - rec.HEAD_SIZE - places).astype(np.uint64)
+    return places[(length <= room) & (length >= least[data[places]].astype(np.uint64))]
 
 
 _STEPS_PER_JUMP: Final = 20
