@@ -34,7 +34,7 @@ from pipeline.logs.records import (
     is_whole,
 )
 from pipeline.logs.remote import RemotePath, RemoteSource
-from pipeline.logs.scan import Scanner, SequenceCheck
+from pipeline.logs.scan import Numbered, Scanner, find_missing
 from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
 
 _HASH_BLOCK: Final = 1 << 20
@@ -432,12 +432,13 @@ def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
     catalog.counts = {}
     examined: list[Span] = []
     losses = dict.fromkeys(catalog.losses)
-    sequences = SequenceCheck()
+    numbered: list[Numbered] = []
     for span, loaded in load_spans(source, catalog.spans, _forget_chunk, threads=threads):
         messages = loaded.messages
         losses.update(dict.fromkeys(loaded.losses))
         _add_descriptions(catalog, loaded)
-        sequences.add(span, loaded)
+        if span.kind is SpanKind.CHUNK and not loaded.losses:
+            numbered.append((span, messages.channel, messages.sequence, messages.log_time))
         numbers, counts = np.unique(messages.channel, return_counts=True)
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
             catalog.counts[number] = catalog.counts.get(number, 0) + count
@@ -452,7 +453,7 @@ def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
         catalog.add_description(record, covered=False)
     catalog.spans = examined
     catalog.losses = list(losses | dict.fromkeys(catalog.losses))
-    catalog.losses += sequences.find_losses(catalog.channels)
+    catalog.losses += find_missing(numbered, catalog.channels)
     for number in sorted(catalog.counts.keys() - catalog.channels.keys()):
         text = f"{catalog.counts.pop(number)} messages of channel {number}, whose own record is lost"
         catalog.losses.append(Loss("unknown_channel", text, start_ns=catalog.start_ns, end_ns=catalog.end_ns))
