@@ -1,7 +1,7 @@
 """The catalog of a file's contents, its coverage by checksums, and the limit of its inflated size."""
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -170,6 +170,7 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         taken += work if fits else 0
         (within if fits else omitted).append(span)
     catalog.spans = within
+    starts, ends = _list_times(omitted)
     text = (
         f"the chunks of the file decompress to {format_size(total)}, {total / size:.0f} times its size, and "
         f"at most {format_size(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks "
@@ -181,8 +182,8 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
             text,
             bytes=sum(span.length for span in omitted),
             chunks=len(omitted),
-            start_ns=min(_list_known(span.start_ns for span in omitted), default=None),
-            end_ns=max(_list_known(span.end_ns for span in omitted), default=None),
+            start_ns=min(starts, default=None),
+            end_ns=max(ends, default=None),
         )
     )
 
@@ -192,8 +193,10 @@ def _work(inflated: int, stored: int) -> int:
     return inflated if inflated <= largest_plausible(stored) else 0
 
 
-def _list_known(times: Iterable[int | None]) -> list[int]:
-    return [time for time in times if time is not None]
+def _list_times(spans: Sequence[Span]) -> tuple[list[int], list[int]]:
+    """Known first and last log times of spans [ns]."""
+    starts = [span.start_ns for span in spans if span.start_ns is not None]
+    return starts, [span.end_ns for span in spans if span.end_ns is not None]
 
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
@@ -260,13 +263,12 @@ class DataSection:
                 f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
                 "something else is damaged, such as metadata or chunks that were not read"
             )
-        times = [span.start_ns for span in self._catalog.spans if span.start_ns is not None]
-        ends = [span.end_ns for span in self._catalog.spans if span.end_ns is not None]
+        starts, ends = _list_times(self._catalog.spans)
         return Loss(
             "checksum_mismatch",
             text,
             bytes=self._catalog.data_end or 0,
-            start_ns=min(times, default=None),
+            start_ns=min(starts, default=None),
             end_ns=max(ends, default=None),
         )
 

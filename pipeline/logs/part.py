@@ -10,11 +10,11 @@ import struct
 import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
@@ -174,11 +174,9 @@ class _DamagedSummaryError(_NoSummaryError):
     """The summary is damaged or cut off; the text states the damage."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Summary:
+class _Summary(NamedTuple):
     start: int
     statistics: Statistics
-    chunks: list[ChunkIndex]
     side_records: set[tuple[int, int, str]]
 
 
@@ -216,11 +214,20 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
             text = f"{reason}; all records were read instead"
             catalog.losses.append(Loss("damaged_summary", text))
     else:
-        _scan_gaps(source, catalog, start, summary.start)
+        unlisted = _scan_gaps(source, catalog, start, summary.start)
         keep_within(catalog, source.size, max_inflated)
-        _compare_side_records(catalog, summary)
-        if not _take_statistics(catalog, summary):
+        for _, _, name in sorted(summary.side_records - catalog.side_records):
+            text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
+            catalog.losses.append(Loss("contradiction", text))
+        statistics = summary.statistics
+        if unlisted:
+            catalog.notes.append(f"{unlisted} chunks that the summary does not list were found")
             examine_spans(source, catalog, threads)
+        else:
+            catalog.counts = dict(statistics.channel_message_counts)
+        if statistics.message_count and not unlisted:
+            catalog.start_ns = rec.clip_time(statistics.message_start_time)
+            catalog.end_ns = rec.clip_time(statistics.message_end_time)
     catalog.losses += [*catalog.find_contradictions(), *catalog.extras.find_losses()]
     return catalog
 
@@ -346,7 +353,7 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog, *, covered: bool) 
     if statistics is None:
         raise _NoSummaryError("the summary has no statistics")
     _check_summary(statistics, chunks, start, catalog)
-    return _Summary(start, statistics, chunks, listed)
+    return _Summary(start, statistics, listed)
 
 
 def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int, catalog: Catalog) -> None:
@@ -380,42 +387,21 @@ def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int,
         raise _DamagedSummaryError("the summary places chunks beyond the data")
 
 
-def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> None:
-    """Scan the ranges that no chunk index covers: metadata, attachments, messages outside chunks."""
-    listed = list(catalog.spans)
-    spans: list[Span] = []
-    position = start
-    for span in [*listed, None]:
-        until = stop if span is None else span.offset
+def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> int:
+    """Scan the ranges that no chunk index covers: metadata, attachments, messages outside chunks.
+
+    Returns:
+        Number of chunks in them.
+    """
+    listed, found = list(catalog.spans), list[Span]()
+    ends = [start, *(span.offset + span.length + span.index_length for span in listed)]
+    for position, until in zip(ends, [*(span.offset for span in listed), stop], strict=True):
         if until > position:
             catalog.spans = []
             Scanner(source, catalog).scan(position, until)
-            spans += catalog.spans
-        if span is not None:
-            position = span.offset + span.length + span.index_length
-    catalog.spans = sorted([*listed, *spans], key=lambda each: each.offset)
-
-
-def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
-    """Check that metadata and attachments have the offset, length and name stated in the summary."""
-    for _, _, name in sorted(summary.side_records - catalog.side_records):
-        text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
-        catalog.losses.append(Loss("contradiction", text))
-
-
-def _take_statistics(catalog: Catalog, summary: _Summary) -> bool:
-    """Use the counts and times of the summary if it lists all chunks; returns whether it does."""
-    statistics = summary.statistics
-    unlisted = {chunk.chunk_start_offset for chunk in summary.chunks}
-    extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
-    if extra:
-        catalog.notes.append(f"{len(extra)} chunks that the summary does not list were found")
-        return False
-    catalog.counts = dict(statistics.channel_message_counts)
-    if statistics.message_count:
-        catalog.start_ns = rec.clip_time(statistics.message_start_time)
-        catalog.end_ns = rec.clip_time(statistics.message_end_time)
-    return True
+            found += catalog.spans
+    catalog.spans = sorted([*listed, *found], key=attrgetter("offset"))
+    return sum(span.kind is not SpanKind.LOOSE for span in found)
 
 
 def _add_descriptions(catalog: Catalog, loaded: Loaded) -> None:

@@ -186,15 +186,13 @@ class Scanner:
         ):
             inside = self._find(previous + 1, stop)
             if inside < position:
-                self._drop_message(previous)
+                # The length of the message before is damaged.
+                self._catalog.spans.pop()
+                if previous > last.offset:
+                    self._catalog.spans.append(replace(last, length=previous - last.offset))
                 position, again = previous, inside
         self._note_damage(position, again, stop)
         return again, position
-
-    def _drop_message(self, position: int) -> None:
-        last = self._catalog.spans.pop()
-        if position > last.offset:
-            self._catalog.spans.append(replace(last, length=position - last.offset))
 
     def _find(self, start: int, stop: int) -> int:
         low, size = start, _FIRST_BLOCK
