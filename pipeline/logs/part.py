@@ -393,15 +393,15 @@ def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> i
     Returns:
         Number of chunks in them.
     """
-    listed, found = list(catalog.spans), list[Span]()
+    listed, unlisted = list(catalog.spans), list[Span]()
     ends = [start, *(span.offset + span.length + span.index_length for span in listed)]
     for position, until in zip(ends, [*(span.offset for span in listed), stop], strict=True):
         if until > position:
             catalog.spans = []
             Scanner(source, catalog).scan(position, until)
-            found += catalog.spans
-    catalog.spans = sorted([*listed, *found], key=attrgetter("offset"))
-    return sum(span.kind is not SpanKind.LOOSE for span in found)
+            unlisted += catalog.spans
+    catalog.spans = sorted([*listed, *unlisted], key=attrgetter("offset"))
+    return sum(span.kind is not SpanKind.LOOSE for span in unlisted)
 
 
 def _add_descriptions(catalog: Catalog, loaded: Loaded) -> None:

@@ -285,10 +285,10 @@ def find_missing(chunks: Sequence[Numbered], channels: Mapping[int, Channel]) ->
     is_common = find_jumps(every) is not None
     jumps_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
     series = [every] if is_common else group_rows(channel)
-    found = [(rows, find_jumps(rows)) for rows in series]
+    judged = [(rows, find_jumps(rows)) for rows in series]
     # Numbers that another channel may have used are no gap: the writer may number both together.
-    ranges = [(sequence[rows].min(), sequence[rows].max()) for rows, jumps in found if jumps is None]
-    for rows, jumps in found:
+    ranges = [(sequence[rows].min(), sequence[rows].max()) for rows, jumps in judged if jumps is None]
+    for rows, jumps in judged:
         for a, b in () if jumps is None else zip(rows[jumps].tolist(), rows[jumps + 1].tolist(), strict=True):
             if all(high <= sequence[a] or low >= sequence[b] for low, high in ranges):
                 jumps_of.setdefault((chunk[a], chunk[b]), []).append((a, b))
