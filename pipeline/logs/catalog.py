@@ -1,10 +1,10 @@
 """The catalog of a file's contents, its coverage by checksums, and the limit of its inflated size."""
 
-from collections.abc import Iterable
+import zlib
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
 from mcap.records import Channel, Schema
 
@@ -12,33 +12,14 @@ from pipeline.core import format_size, name_first
 from pipeline.logs.chunks import largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
-from pipeline.logs.spans import Span, SpanKind, checksum_holds
+from pipeline.logs.spans import Span, SpanKind
 
+_MAX_EXTRAS: Final = 64 << 20
+"""Maximum size of a file's metadata and names of attachments [bytes]; the largest recorded is a robot
+description of some MB."""
 
-class Cover(IntEnum):
-    """Evidence that a schema or channel record is undamaged, in ascending order.
-
-    Damage does not change two copies identically, so their agreement is equivalent to a checksum.
-    """
-
-    SUMMARY = 0
-    """It is in a summary without a checksum, or with one that does not match."""
-    DATA = 1
-    """It is in the data section, and no checksum of a chunk covers it."""
-    AGREED = 2
-    """It is in the file twice, and both copies agree."""
-    CHECKSUM = 3
-    """The checksum of a chunk or of the summary covers it."""
-
-
-_MAX_EXTRAS: Final = 100_000
-"""Maximum number of metadata and attachment entries per file; recorders write tens, each read in 3 us."""
-
-_MAX_ENTRIES: Final = 10_000
-"""Maximum number of entries of one metadata record, so that one record cannot use up `_MAX_EXTRAS`."""
-
-_MAX_EXTRA_BYTES: Final = 64 << 20
-"""Maximum size of a file's metadata [bytes]; the largest recorded is a robot description of some MB."""
+_ENTRY: Final = 640
+"""What an entry is charged besides its bytes [bytes], for the time and the memory that it takes."""
 
 
 @dataclass(slots=True)
@@ -46,27 +27,23 @@ class Extras:
     """Remaining budget for metadata and attachments, of which a file may contain any number.
 
     Attributes:
-        entries: remaining number of entries.
-        size: remaining size [bytes].
+        remaining: remaining size [bytes].
         omitted: number of records beyond the budget.
     """
 
-    entries: int = _MAX_EXTRAS
-    size: int = _MAX_EXTRA_BYTES
+    remaining: int = _MAX_EXTRAS
     omitted: int = 0
 
     @property
     def most(self) -> int:
         """Maximum number of entries of the next record."""
-        return min(self.entries, _MAX_ENTRIES)
+        return max(self.remaining, 0) // _ENTRY
 
-    def take(self, entries: int | None, size: int) -> bool:
-        """Charge a record; returns whether it fits. ``entries`` is None if it has more than `most`."""
-        fits = entries is not None and self.entries > 0 and size <= self.size
-        self.entries -= min(self.entries, 1 + (self.most if entries is None else entries))
-        self.size -= size if fits else 0
-        self.omitted += not fits
-        return fits
+    def take(self, entries: int, size: int) -> bool:
+        """Charge a record; returns whether it fits."""
+        self.remaining -= size + _ENTRY * (1 + entries)
+        self.omitted += self.remaining < 0
+        return self.remaining >= 0
 
     def find_losses(self) -> list[Loss]:
         """The loss for the omitted records, if any."""
@@ -74,8 +51,7 @@ class Extras:
             return []
         text = (
             f"{self.omitted} metadata records and attachments were left out: no more than "
-            f"{_MAX_EXTRAS} entries and {_MAX_EXTRA_BYTES >> 20} MiB of them are read, "
-            f"{_MAX_ENTRIES} entries of one record"
+            f"{_MAX_EXTRAS >> 20} MiB of them are read, or {_MAX_EXTRAS // _ENTRY:,} entries"
         )
         return [Loss("too_large", text)]
 
@@ -98,9 +74,9 @@ class Catalog:
     library: str = ""
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    covers: dict[tuple[type, int], Cover] = field(default_factory=dict)
+    bare: set[tuple[type, int]] = field(default_factory=set)
     contradicted: set[tuple[type, int]] = field(default_factory=set)
-    rivals: dict[tuple[type, int], Schema | Channel] = field(default_factory=dict)
+    repeated: list[Schema | Channel] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
     bag_chunks: int = 0
     compressions: set[str] = field(default_factory=set)
@@ -120,88 +96,36 @@ class Catalog:
         """Number of chunks; 0 of a file that has none."""
         return self.bag_chunks + sum(span.kind.value != "loose" for span in self.spans)
 
-    def add_description(self, record: Schema | Channel, cover: Cover) -> None:
-        """Add a schema or channel; of differing copies the one with more evidence is used, or the first."""
+    def add_description(self, record: Schema | Channel, *, covered: bool) -> None:
+        """Add a schema or channel: the first of a number counts, or the first that a checksum covers."""
+        held: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         key = (type(record), record.id)
-        known = self._find(record)
-        before = self.covers.get(key)
-        if known is None or before is None:
-            self._set(record)
-            self.covers[key] = cover
-            return
-        if is_alike(known, record):
-            self.covers[key] = max(before, cover, Cover.AGREED)
-            return
-        if cover > before:
-            self._set(record)
-            self.covers[key] = cover
-        if max(cover, before) is Cover.DATA and min(cover, before) is Cover.SUMMARY:
-            self.rivals[key] = known if cover > before else record
-        if key not in self.contradicted:
+        known = held.get(record.id)
+        if known is not None and (covered or key in self.bare) and not _is_alike(known, record):
             self.contradicted.add(key)
-            self.losses.append(_note_contradiction(record, before, cover))
+        if known is None or (covered and key in self.bare):
+            held[record.id] = record
+            (self.bare.discard if covered else self.bare.add)(key)
 
-    def distrust_data(self) -> None:
-        """Use the summary where the data section contradicts it without a valid checksum."""
-        for key, record in self.rivals.items():
-            if self.covers[key] is Cover.DATA:
-                self._set(record)
+    def is_bare(self, number: int) -> bool:
+        """Whether no checksum covers the channel record of a number, or none covers its schema."""
+        return not self.bare.isdisjoint({(Channel, number), (Schema, self.channels[number].schema_id)})
 
-    def find_contradictions(self, records: Iterable[Schema | Channel], cover: Cover) -> list[Loss]:
-        """Losses for schemas and channels of a chunk that differ from those of the rest of the file.
-
-        Args:
-            records: schemas and channels of the chunk.
-            cover: evidence for them.
-        """
-        losses = []
-        for record in records:
-            known, key = self._find(record), (type(record), record.id)
-            if known is not None and key not in self.contradicted and not is_alike(known, record):
-                losses.append(_note_contradiction(record, self.covers.get(key, Cover.DATA), cover))
-        return losses
-
-    def is_covered(self, number: int, *, data_holds: bool) -> bool:
-        """Whether there is evidence for the schema and channel record of a channel.
-
-        Args:
-            number: channel number.
-            data_holds: whether the checksum of the data section is valid.
-        """
-        channel = self.channels[number]
-        least = Cover.DATA if data_holds else Cover.AGREED
-        keys = [(Channel, number), *([(Schema, channel.schema_id)] if channel.schema_id else [])]
-        return all(self.covers.get(key, Cover.CHECKSUM) >= least for key in keys)
-
-    def _find(self, record: Schema | Channel) -> Schema | Channel | None:
-        if isinstance(record, Schema):
-            return self.schemas.get(record.id)
-        return self.channels.get(record.id)
-
-    def _set(self, record: Schema | Channel) -> None:
-        if isinstance(record, Schema):
-            self.schemas[record.id] = record
-        else:
-            self.channels[record.id] = record
+    def find_contradictions(self) -> list[Loss]:
+        """The loss for schemas and channels with differing copies, if any."""
+        if not self.contradicted:
+            return []
+        names = sorted(f"{kind.__name__.lower()} {number}" for kind, number in self.contradicted)
+        text = f"the file describes {name_first(names)} in two ways: messages of it may be wrong"
+        return [Loss("contradiction", text)]
 
 
-def is_alike(one: Schema | Channel, other: Schema | Channel) -> bool:
+def _is_alike(one: Schema | Channel, other: Schema | Channel) -> bool:
     """Whether two records with the same number agree in all values that decoding uses."""
-    if one == other:
-        return True
-    if not isinstance(one, Channel) or not isinstance(other, Channel):
-        return False
-    # Recorders may add to a channel's metadata, which decoding does not use.
-    return replace(one, metadata={}) == replace(other, metadata={})
-
-
-def _note_contradiction(record: Schema | Channel, *covers: Cover) -> Loss:
-    """Loss for a schema or channel with two differing copies, with the evidence for each copy."""
-    name = f"channel {record.id}" if isinstance(record, Channel) else f"schema {record.id}"
-    end = "one of the two is damaged, and its messages may be wrong"
-    if min(covers) < Cover.AGREED < max(covers):
-        end = "the one that a checksum covers was used"
-    return Loss("contradiction", f"the file describes {name} in two ways: {end}")
+    if isinstance(one, Channel) and isinstance(other, Channel):
+        # Recorders may add to a channel's metadata, which decoding does not use.
+        return replace(one, metadata={}) == replace(other, metadata={})
+    return one == other
 
 
 OVER_BUDGET: Final = "max_inflated"
@@ -246,6 +170,7 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         taken += work if fits else 0
         (within if fits else omitted).append(span)
     catalog.spans = within
+    starts, ends = _list_times(omitted)
     text = (
         f"the chunks of the file decompress to {format_size(total)}, {total / size:.0f} times its size, and "
         f"at most {format_size(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks "
@@ -257,8 +182,8 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
             text,
             bytes=sum(span.length for span in omitted),
             chunks=len(omitted),
-            start_ns=min(_list_known(span.start_ns for span in omitted), default=None),
-            end_ns=max(_list_known(span.end_ns for span in omitted), default=None),
+            start_ns=min(starts, default=None),
+            end_ns=max(ends, default=None),
         )
     )
 
@@ -268,11 +193,24 @@ def _work(inflated: int, stored: int) -> int:
     return inflated if inflated <= largest_plausible(stored) else 0
 
 
-def _list_known(times: Iterable[int | None]) -> list[int]:
-    return [time for time in times if time is not None]
+def _list_times(spans: Sequence[Span]) -> tuple[list[int], list[int]]:
+    """Known first and last log times of spans [ns]."""
+    starts = [span.start_ns for span in spans if span.start_ns is not None]
+    return starts, [span.end_ns for span in spans if span.end_ns is not None]
 
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
+
+
+_CRC_BLOCK: Final = 1 << 20
+
+
+def _checksum_holds(source: ByteSource, end: int, crc: int) -> bool:
+    """Whether the checksum of the data section, the first ``end`` bytes of a file, is valid."""
+    computed = 0
+    for offset in range(0, end, _CRC_BLOCK):
+        computed = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, end - offset)), computed)
+    return computed == crc
 
 
 class DataSection:
@@ -296,7 +234,7 @@ class DataSection:
     def _begin(self) -> None:
         end, crc = self._catalog.data_end, self._catalog.data_crc
         if self._check is None and end is not None and crc:
-            self._check = self._beside.submit(checksum_holds, self._source, end, crc)
+            self._check = self._beside.submit(_checksum_holds, self._source, end, crc)
 
     def holds(self) -> bool:
         """Whether there is such a checksum and it is valid."""
@@ -325,13 +263,12 @@ class DataSection:
                 f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
                 "something else is damaged, such as metadata or chunks that were not read"
             )
-        times = [span.start_ns for span in self._catalog.spans if span.start_ns is not None]
-        ends = [span.end_ns for span in self._catalog.spans if span.end_ns is not None]
+        starts, ends = _list_times(self._catalog.spans)
         return Loss(
             "checksum_mismatch",
             text,
             bytes=self._catalog.data_end or 0,
-            start_ns=min(times, default=None),
+            start_ns=min(starts, default=None),
             end_ns=max(ends, default=None),
         )
 
@@ -340,7 +277,7 @@ class DataSection:
 class Coverage:
     """Number of spans with messages that were read, and of those without a checksum.
 
-    ``topics`` are those whose definitions have neither a checksum nor a second copy.
+    ``topics`` are those whose definitions have no checksum.
     """
 
     spans: int = 0
@@ -349,17 +286,17 @@ class Coverage:
 
     def format_coverage(self) -> str:
         """Description of the unchecked data; empty if all data read is covered."""
-        said = []
         if self.unchecked and self.unchecked == self.spans:
-            said.append(_NOTHING_COVERED)
-        elif self.unchecked:
+            return _NOTHING_COVERED
+        said = []
+        if self.unchecked:
             said.append(
                 f"{self.unchecked} of {self.spans} stretches of it carry no checksum: "
                 "damage in them cannot be seen"
             )
         if self.topics:
             said.append(
-                f"no checksum and no second copy covers what the log says of {name_first(self.topics)}: "
+                f"no checksum covers what the log says of {name_first(self.topics)}: "
                 "names and types of their fields may be damaged"
             )
         return "; ".join(said)

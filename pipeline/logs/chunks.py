@@ -14,17 +14,15 @@ from numpy.typing import NDArray
 
 from pipeline.core import Ints, format_size
 from pipeline.logs import records as rec
-from pipeline.logs.records import Buffer, Effort, find_record
+from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30
 """Maximum inflated size of a chunk [bytes]; recorders write 1 to 100 MB."""
 
+_COMPRESSIONS: Final = ("", "zstd", "lz4")
 _PLAUSIBLE: Final = 256 << 20
 _PLAUSIBLE_RATIO: Final = 1000
 """Maximum inflation ratio of a chunk larger than `_PLAUSIBLE` bytes; only malicious files exceed it."""
-
-_MAX_RATIO: Final = {"": 1, "zstd": 40_000, "lz4": 260}
-"""Maximum inflation ratio of the formats: zstd stores 128 KiB in four bytes, LZ4 255 bytes in one."""
 
 _LZ4_FLAGS: Final = 4
 _LZ4_HAS_CHECKSUM: Final = 0x04
@@ -76,10 +74,8 @@ def check_size(stored: int, compression: str, size: int) -> None:
     Raises:
         InflateError: it is not, or the compression is unknown.
     """
-    if compression not in _MAX_RATIO:
+    if compression not in _COMPRESSIONS:
         raise InflateError(f"the compression {compression[:20]!r} is not known")
-    if size > MAX_CHUNK or size > stored * _MAX_RATIO[compression] + 1024:
-        raise InflateError(f"{stored} bytes cannot hold {size}")
     if size > largest_plausible(stored):
         raise InflateError(f"{stored} bytes say they hold {size}, as no recording does")
 
@@ -154,10 +150,8 @@ def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO
 # Locating the messages among the records of one inflated chunk.
 #
 # The message indexes after a chunk state the offsets of its messages, so that Python need not visit every
-# record. They are used only if all entries agree with the records; uncovered ranges are scanned.
-
-CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
-"""Kinds of record that occur in a chunk."""
+# record. They are used only if all entries agree with the records; uncovered ranges are scanned, each up to
+# the first bytes that are no record.
 
 FIRST_PRIVATE: Final = 0x80
 """First private opcode; the specification requires that such records are skipped."""
@@ -207,7 +201,6 @@ class Messages:
 
 @dataclass(slots=True)
 class _WalkedChunk:
-    effort: Effort
     known: set[tuple[int, bytes]] = field(default_factory=set)
     offsets: list[int] = field(default_factory=list)
     descriptions: list[Schema | Channel] = field(default_factory=list)
@@ -215,17 +208,16 @@ class _WalkedChunk:
 
 
 def locate_messages(
-    chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None, stored: int
+    chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None = None
 ) -> Messages:
     """Locate all messages of a chunk.
 
     Args:
         chunk: its inflated records.
         entries: channel and entries of every message index after it; None if there are none.
-        stored: size of the chunk in the file [bytes].
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
-    located = _WalkedChunk(Effort.for_bytes(stored))
+    located = _WalkedChunk()
     agreed = None if entries is None else _agreeing_messages(data, entries)
     if agreed is None:
         _walk(chunk, 0, data.size, located)
@@ -293,23 +285,18 @@ def _agreeing_messages(
 
 
 def _walk(chunk: Buffer, start: int, end: int, located: _WalkedChunk) -> None:
+    """Note the records from ``start`` on; what follows the first bytes that are none is damage."""
     unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
     position = start
-    before: int | None = None
     while position < end:
         opcode, length = unpack(chunk, position) if position + head_size <= end else (0, 0)
         after = position + head_size + length
         if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
             located.offsets.append(position)
-            before, position = position, after
-        elif (
-            opcode
-            and after <= end
-            and _take_side_record(opcode, chunk[position + head_size : after], located)
-        ):
-            before, position = None, after
-        else:
-            before, position = None, _resume(chunk, before, position, end, located)
+        elif after > end or not _take_side_record(opcode, chunk[position + head_size : after], located):
+            located.damage.append((position, end))
+            return
+        position = after
 
 
 def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
@@ -328,23 +315,6 @@ def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
     located.descriptions.append(record)
     located.known.add(content)
     return True
-
-
-def _resume(chunk: Buffer, before: int | None, position: int, end: int, located: _WalkedChunk) -> int:
-    """Record damage at ``position``; returns the offset of the next record.
-
-    If that lies inside the message that starts at ``before`` and ends at ``position``, the length of this
-    message is damaged, and the message is dropped.
-    """
-    first = position + 1 if before is None else before + 1
-    again = find_record(chunk, first, end, CHUNK_RECORDS, located.effort)
-    if before is not None and again < position:
-        located.offsets.pop()
-        position = before
-    elif again <= position:
-        again = find_record(chunk, position + 1, end, CHUNK_RECORDS, located.effort)
-    located.damage.append((position, again))
-    return again
 
 
 @cache

@@ -10,12 +10,11 @@ import struct
 import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import replace
 from itertools import islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
@@ -23,7 +22,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 from pipeline.core import guess_names
 from pipeline.logs import records as rec
 from pipeline.logs.bags import catalog_bag
-from pipeline.logs.catalog import Catalog, Cover, keep_within
+from pipeline.logs.catalog import Catalog, keep_within
 from pipeline.logs.compressed import COMPRESSED, open_inflated
 from pipeline.logs.records import (
     LONGEST_HEAD,
@@ -35,8 +34,8 @@ from pipeline.logs.records import (
     is_whole,
 )
 from pipeline.logs.remote import RemotePath, RemoteSource
-from pipeline.logs.scan import Scanner, SequenceCheck
-from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs, checksum_holds, load_spans
+from pipeline.logs.scan import Numbered, Scanner, find_missing
+from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
 
 _HASH_BLOCK: Final = 1 << 20
 _MOST_NEIGHBOURS: Final = 1000
@@ -175,12 +174,9 @@ class _DamagedSummaryError(_NoSummaryError):
     """The summary is damaged or cut off; the text states the damage."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Summary:
+class _Summary(NamedTuple):
     start: int
-    checked: bool
     statistics: Statistics
-    chunks: list[ChunkIndex]
     side_records: set[tuple[int, int, str]]
 
 
@@ -204,7 +200,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
     stop = source.size - len(rec.MAGIC) if ends_well and source.size >= 2 * len(rec.MAGIC) else source.size
     try:
-        summary = _read_summary(source, catalog)
+        summary = _read_summary(source, catalog, threads)
     except _NoSummaryError as reason:
         damaged = catalog.losses
         catalog = Catalog(losses=list(damaged))
@@ -218,23 +214,22 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
             text = f"{reason}; all records were read instead"
             catalog.losses.append(Loss("damaged_summary", text))
     else:
-        _scan_gaps(source, catalog, start, summary.start)
+        unlisted = _scan_gaps(source, catalog, start, summary.start)
         keep_within(catalog, source.size, max_inflated)
-        _compare_side_records(catalog, summary)
-        if not _take_statistics(catalog, summary):
+        for _, _, name in sorted(summary.side_records - catalog.side_records):
+            text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
+            catalog.losses.append(Loss("contradiction", text))
+        statistics = summary.statistics
+        if unlisted:
+            catalog.notes.append(f"{unlisted} chunks that the summary does not list were found")
             examine_spans(source, catalog, threads)
-        elif not summary.checked:
-            _compare_descriptions(source, catalog, threads)
-        if catalog.rivals and not _data_holds(source, catalog):
-            catalog.distrust_data()
-    catalog.losses += catalog.extras.find_losses()
+        else:
+            catalog.counts = dict(statistics.channel_message_counts)
+        if statistics.message_count and not unlisted:
+            catalog.start_ns = rec.clip_time(statistics.message_start_time)
+            catalog.end_ns = rec.clip_time(statistics.message_end_time)
+    catalog.losses += [*catalog.find_contradictions(), *catalog.extras.find_losses()]
     return catalog
-
-
-def _data_holds(source: ByteSource, catalog: Catalog) -> bool:
-    """Whether the data section has a valid checksum."""
-    end = catalog.data_end
-    return end is not None and bool(catalog.data_crc) and checksum_holds(source, end, catalog.data_crc)
 
 
 def is_written_to(path: Path) -> bool:
@@ -284,7 +279,7 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     return len(rec.MAGIC)
 
 
-def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
+def _read_summary(source: ByteSource, catalog: Catalog, threads: int) -> _Summary:
     tail_size = rec.FOOTER_SIZE + len(rec.MAGIC)
     tail = source.read_at(max(0, source.size - tail_size), tail_size)
     if len(tail) < rec.FOOTER_SIZE + len(rec.MAGIC) or not tail.endswith(rec.MAGIC):
@@ -302,23 +297,36 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     if crc and zlib.crc32(body + tail[: rec.HEAD_SIZE + 16]) != crc:
         raise _DamagedSummaryError("the summary is damaged")
     try:
-        summary = _parse_summary(body, start, catalog, Cover.CHECKSUM if crc else Cover.SUMMARY)
+        summary = _parse_summary(body, start, catalog, covered=bool(crc))
     except rec.RecordError as error:
         raise _DamagedSummaryError(f"the summary is damaged ({error})") from None
     if not crc:
-        _compare_chunks(source, summary.chunks)
+        _compare_summary(source, catalog, threads)
     return summary
 
 
-def _compare_chunks(source: ByteSource, chunks: list[ChunkIndex]) -> None:
-    """Check that chunks are at the offsets stated by a summary without a checksum."""
-    for chunk in chunks:
-        head = source.read_at(chunk.chunk_start_offset, rec.HEAD_SIZE)
-        if head != rec.HEAD.pack(rec.CHUNK, chunk.chunk_length - rec.HEAD_SIZE):
+def _compare_summary(source: ByteSource, catalog: Catalog, threads: int) -> None:
+    """Compare a summary without a checksum with the chunks that it lists, and those in which channels begin.
+
+    Recorders repeat the records of a channel there.
+    """
+    sought = set(catalog.channels)
+    chosen: list[Span] = []
+    for span in catalog.spans:
+        if source.read_at(span.offset, rec.HEAD_SIZE) != rec.HEAD.pack(
+            rec.CHUNK, span.length - rec.HEAD_SIZE
+        ):
             raise _DamagedSummaryError("the summary disagrees with the chunks")
+        if here := sought if span.channels is None else span.channels & sought:
+            chosen.append(span)
+            sought = sought - here
+    for _, loaded in load_spans(source, chosen, _forget_chunk, threads=threads):
+        _add_descriptions(catalog, loaded)
+    if catalog.contradicted:
+        raise _DamagedSummaryError("the summary disagrees with the chunks")
 
 
-def _parse_summary(body: bytes, start: int, catalog: Catalog, cover: Cover) -> _Summary:
+def _parse_summary(body: bytes, start: int, catalog: Catalog, *, covered: bool) -> _Summary:
     statistics: Statistics | None = None
     chunks: list[ChunkIndex] = []
     listed: set[tuple[int, int, str]] = set()
@@ -335,7 +343,7 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog, cover: Cover) -> _
         position += length
         parsed = rec.parse_record(opcode, record)
         if isinstance(parsed, Schema | Channel):
-            catalog.add_description(parsed, cover)
+            catalog.add_description(parsed, covered=covered)
         elif isinstance(parsed, Statistics):
             statistics = parsed
         elif isinstance(parsed, ChunkIndex):
@@ -345,7 +353,7 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog, cover: Cover) -> _
     if statistics is None:
         raise _NoSummaryError("the summary has no statistics")
     _check_summary(statistics, chunks, start, catalog)
-    return _Summary(start, cover is Cover.CHECKSUM, statistics, chunks, listed)
+    return _Summary(start, statistics, listed)
 
 
 def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int, catalog: Catalog) -> None:
@@ -372,7 +380,6 @@ def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int,
                 rec.clip_time(chunk.message_start_time),
                 rec.clip_time(chunk.message_end_time),
                 frozenset(chunk.message_index_offsets) or None,
-                StoredAs(chunk.compression, chunk.compressed_size, chunk.uncompressed_size),
                 chunk.uncompressed_size,
             )
         )
@@ -380,64 +387,26 @@ def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int,
         raise _DamagedSummaryError("the summary places chunks beyond the data")
 
 
-def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> None:
-    """Scan the ranges that no chunk index covers: metadata, attachments, messages outside chunks."""
-    listed = list(catalog.spans)
-    spans: list[Span] = []
-    position = start
-    for span in [*listed, None]:
-        until = stop if span is None else span.offset
+def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> int:
+    """Scan the ranges that no chunk index covers: metadata, attachments, messages outside chunks.
+
+    Returns:
+        Number of chunks in them.
+    """
+    listed, unlisted = list(catalog.spans), list[Span]()
+    ends = [start, *(span.offset + span.length + span.index_length for span in listed)]
+    for position, until in zip(ends, [*(span.offset for span in listed), stop], strict=True):
         if until > position:
             catalog.spans = []
             Scanner(source, catalog).scan(position, until)
-            spans += catalog.spans
-        if span is not None:
-            position = span.offset + span.length + span.index_length
-    catalog.spans = sorted([*listed, *spans], key=lambda each: each.offset)
-
-
-def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
-    """Check that metadata and attachments have the offset, length and name stated in the summary."""
-    for _, _, name in sorted(summary.side_records - catalog.side_records):
-        text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
-        catalog.losses.append(Loss("contradiction", text))
-
-
-def _take_statistics(catalog: Catalog, summary: _Summary) -> bool:
-    """Use the counts and times of the summary if it lists all chunks; returns whether it does."""
-    statistics = summary.statistics
-    unlisted = {chunk.chunk_start_offset for chunk in summary.chunks}
-    extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
-    if extra:
-        catalog.notes.append(f"{len(extra)} chunks that the summary does not list were found")
-        return False
-    catalog.counts = dict(statistics.channel_message_counts)
-    if statistics.message_count:
-        catalog.start_ns = rec.clip_time(statistics.message_start_time)
-        catalog.end_ns = rec.clip_time(statistics.message_end_time)
-    return True
-
-
-def _compare_descriptions(source: ByteSource, catalog: Catalog, threads: int) -> None:
-    """Compare the channels in a summary without a checksum with the chunks in which they begin.
-
-    Recorders repeat the records of a channel there.
-    """
-    sought = set(catalog.channels)
-    chosen: list[Span] = []
-    for span in catalog.spans:
-        here = sought if span.channels is None else span.channels & sought
-        if span.kind is SpanKind.CHUNK and here:
-            chosen.append(span)
-            sought -= here
-    for loaded in load_spans(source, chosen, _forget_chunk, threads=threads):
-        _add_descriptions(catalog, loaded[1])
+            unlisted += catalog.spans
+    catalog.spans = sorted([*listed, *unlisted], key=attrgetter("offset"))
+    return sum(span.kind is not SpanKind.LOOSE for span in unlisted)
 
 
 def _add_descriptions(catalog: Catalog, loaded: Loaded) -> None:
-    cover = Cover.DATA if loaded.unchecked else Cover.CHECKSUM
     for record in loaded.messages.descriptions:
-        catalog.add_description(record, cover)
+        catalog.add_description(record, covered=not loaded.unchecked)
 
 
 def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
@@ -449,15 +418,13 @@ def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
     catalog.counts = {}
     examined: list[Span] = []
     losses = dict.fromkeys(catalog.losses)
-    sequences = SequenceCheck()
-
-    file_holds = cache(partial(_data_holds, source, catalog))
-    summaries = load_spans(source, catalog.spans, _forget_chunk, threads=threads, file_holds=file_holds)
-    for span, loaded in summaries:
+    numbered: list[Numbered] = []
+    for span, loaded in load_spans(source, catalog.spans, _forget_chunk, threads=threads):
         messages = loaded.messages
         losses.update(dict.fromkeys(loaded.losses))
         _add_descriptions(catalog, loaded)
-        sequences.add(span, loaded)
+        if span.kind is SpanKind.CHUNK and not loaded.losses:
+            numbered.append((span, messages.channel, messages.sequence, messages.log_time))
         numbers, counts = np.unique(messages.channel, return_counts=True)
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
             catalog.counts[number] = catalog.counts.get(number, 0) + count
@@ -468,9 +435,11 @@ def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
             if span.start_ns is None:
                 span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
         examined.append(replace(span, channels=frozenset(numbers.tolist())))
+    for record in catalog.repeated:
+        catalog.add_description(record, covered=False)
     catalog.spans = examined
     catalog.losses = list(losses | dict.fromkeys(catalog.losses))
-    catalog.losses += sequences.find_losses(catalog.channels)
+    catalog.losses += find_missing(numbered, catalog.channels)
     for number in sorted(catalog.counts.keys() - catalog.channels.keys()):
         text = f"{catalog.counts.pop(number)} messages of channel {number}, whose own record is lost"
         catalog.losses.append(Loss("unknown_channel", text, start_ns=catalog.start_ns, end_ns=catalog.end_ns))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import Ints, group_by, map_in_order, name_first, usable_threads
 from pipeline.logs.bags import read_bag
-from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
+from pipeline.logs.catalog import Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
 from pipeline.logs.columns import (
@@ -177,7 +177,7 @@ def read_topics(
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
         for part, source, section in zip(index.parts, sources, sections, strict=True):
             unchecked, is_damaged = 0, bool(index.losses)
-            for gathered in _read_part(source, part, set(jobs), workers, section):
+            for gathered in _read_part(source, part, set(jobs), workers):
                 unchecked += gathered.unchecked
                 coverage.spans += gathered.spans
                 walked += gathered.index_damaged
@@ -340,15 +340,13 @@ def _no_topic(index: LogIndex, topic: str) -> LogError:
 
 
 def _find_uncovered(part: Part, jobs: Mapping[int, _Job], section: DataSection) -> list[str]:
-    """Topics whose schema or channel record is covered by no checksum and no second copy."""
-    own = [number for number, merged in part.numbers.items() if merged in jobs]
-    bare = [number for number in own if not part.catalog.is_covered(number, data_holds=False)]
-    holds = bool(bare) and section.holds()
-    return [
-        jobs[part.numbers[number]].info.topic
-        for number in bare
-        if not part.catalog.is_covered(number, data_holds=holds)
+    """Topics whose schema or channel record is covered by no checksum."""
+    bare = [
+        jobs[merged].info.topic
+        for number, merged in part.numbers.items()
+        if merged in jobs and part.catalog.is_bare(number)
     ]
+    return [] if bare and section.holds() else bare
 
 
 def _list_schemas(index: LogIndex) -> dict[int, bytes]:
@@ -361,9 +359,7 @@ def _list_schemas(index: LogIndex) -> dict[int, bytes]:
     return schemas
 
 
-def _read_part(
-    source: ByteSource, part: Part, wanted: set[int], threads: int, section: DataSection
-) -> Iterator[_Gathered]:
+def _read_part(source: ByteSource, part: Part, wanted: set[int], threads: int) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
@@ -373,14 +369,11 @@ def _read_part(
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
-        cover = Cover.DATA if loaded.unchecked else Cover.CHECKSUM
-        losses = loaded.losses + part.catalog.find_contradictions(loaded.messages.descriptions, cover)
         # A cut chunk at the end of a file is already reported as a loss.
         spans = int(bool(merged) and span.kind is not SpanKind.CUT_CHUNK)
-        return _Gathered(merged, losses, spans, spans * loaded.unchecked, loaded.index_damaged)
+        return _Gathered(merged, loaded.losses, spans, spans * loaded.unchecked, loaded.index_damaged)
 
-    spans = _spans_with(part, own)
-    return load_spans(source, spans, gather, threads=threads, file_holds=section.holds)
+    return load_spans(source, _spans_with(part, own), gather, threads=threads)
 
 
 def _gather_bag(part: Part, payloads: Mapping[int, Payloads], losses: list[Loss]) -> _Gathered:

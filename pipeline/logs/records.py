@@ -1,21 +1,18 @@
-"""What logs are made of: kinds of files by their first bytes, records of an MCAP file, losses and errors.
-
-After damage, the next record is searched for here.
-"""
+"""What logs are made of: kinds of files by their first bytes, records of an MCAP file, losses and errors."""
 
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, Final, Protocol, Self, cast
+from typing import Any, Final, Protocol, cast
 
 import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from numpy.typing import NDArray
 
-from pipeline.core import LONGEST_TEXT, Ints, SlipError, shorten
+from pipeline.core import LONGEST_TEXT, SlipError, shorten
 
 
 class LogError(SlipError):
@@ -283,100 +280,3 @@ def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:
         raise RecordError("a message index says it is longer than its record")
     count = size // _ENTRY_SIZE * 2
     return channel, np.frombuffer(body, dtype="<u8", count=count, offset=_INDEX_HEAD.size).reshape(-1, 2)
-
-
-# Finding the next record after damage.
-#
-# Every byte may be the start of a record. A position is accepted if its opcode and length are possible and so
-# are those of the records after it, for several in a row or up to the end.
-
-_CHAIN: Final = 4
-"""Number of successive records that must be possible; a random position passes one with p < 1e-4."""
-
-FIRST_BLOCK: Final = 1 << 12
-LAST_BLOCK: Final = 1 << 20
-"""First and largest block of a search [bytes]: blocks grow, so that dense damage does not make it slow."""
-
-_SEARCH: Final = 16
-"""Effort of a search for its first block [units]; each tested position adds one unit."""
-
-_LEAST_EFFORT: Final = 1 << 6
-"""Minimum effort for a chunk [units]: up to four searches after damage in the smallest chunk."""
-
-
-@dataclass(slots=True)
-class Effort:
-    """Remaining effort of the search for records in a chunk.
-
-    It is proportional to the stored size, as damage is, and not to the inflated size, which a malicious file
-    can increase at no cost. A unit takes about 2 us.
-
-    Attributes:
-        remaining: remaining effort [units].
-    """
-
-    remaining: int
-
-    @classmethod
-    def for_bytes(cls, stored: int) -> Self:
-        """Effort for a chunk of ``stored`` bytes."""
-        return cls(_LEAST_EFFORT + stored // 2)
-
-    def spend(self, units: int) -> bool:
-        """Spend units; returns whether they were available."""
-        self.remaining -= units
-        return self.remaining >= 0
-
-
-def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int], effort: Effort) -> int:
-    """Position of the next record at or after ``start``; ``end`` if there is none.
-
-    Args:
-        buffer: bytes in memory.
-        start: first position to try.
-        end: end of the records.
-        opcodes: possible kinds of record.
-        effort: remaining effort of the search.
-    """
-    data = np.frombuffer(buffer, dtype=np.uint8)
-    low, block = start, FIRST_BLOCK
-    if not effort.spend(_SEARCH):
-        return end
-    while low <= end - HEAD_SIZE:
-        high = min(low + block, end - HEAD_SIZE + 1)
-        for position in possible_places(data, low, high, end, opcodes).tolist():
-            if not effort.spend(1):
-                return end
-            if _goes_on(buffer, position, end, opcodes):
-                return int(position)
-        low, block = high, min(2 * block, LAST_BLOCK)
-    return end
-
-
-def possible_places(data: NDArray[np.uint8], low: int, high: int, end: int, opcodes: Sequence[int]) -> Ints:
-    """Positions in [low, high) whose opcode and length are possible for a record that ends by ``end``."""
-    least = np.full(256, np.iinfo(np.int64).max, dtype=np.int64)
-    for opcode in opcodes:
-        least[opcode] = LEAST_BODY[opcode]
-    first = min(opcodes)
-    # Most bytes are not an opcode: lengths are checked only after those that may be one.
-    places = np.flatnonzero(data[low:high] - np.uint8(first) <= np.uint8(max(opcodes) - first)) + low
-    heads: NDArray[np.uint64] = np.ndarray((data.size - 8,), "<u8", data, offset=1, strides=(1,))
-    length = heads[places]
-    room = (end - HEAD_SIZE - places).astype(np.uint64)
-    return places[(length <= room) & (length >= least[data[places]].astype(np.uint64))]
-
-
-def _goes_on(buffer: Buffer, position: int, end: int, opcodes: Sequence[int]) -> bool:
-    for _ in range(_CHAIN):
-        if position == end:
-            return True
-        if position + HEAD_SIZE > end:
-            return False
-        opcode, length = HEAD.unpack_from(buffer, position)
-        if opcode not in opcodes or length < LEAST_BODY[opcode]:
-            return False
-        position += HEAD_SIZE + length
-        if position > end:
-            return False
-    return True

@@ -1,25 +1,31 @@
 """Sequential scan of the records that no index covers, and detection of missing chunks."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Final, TypeAlias
 
 import numpy as np
 from mcap.records import Channel, Header, Schema
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, name_first
+from pipeline.core import Ints, group_rows, name_first
 from pipeline.logs import records as rec
-from pipeline.logs.catalog import Catalog, Cover
+from pipeline.logs.catalog import Catalog
 from pipeline.logs.chunks import FIRST_PRIVATE
-from pipeline.logs.records import FIRST_BLOCK, LAST_BLOCK, ByteSource, Loss, possible_places
-from pipeline.logs.spans import Loaded, Span, SpanKind
+from pipeline.logs.records import ByteSource, Loss
+from pipeline.logs.spans import Span, SpanKind
 
 _FIRST_WINDOW: Final = 1 << 12
 _WINDOW: Final = 1 << 18
 _LOOSE_SPAN: Final = 1 << 22
-_KNOWN: Final = tuple(rec.LEAST_BODY)
 _CHAIN: Final = 3
+"""Number of successive records that must be possible; a random position passes one with p < 1e-4."""
+
+_FIRST_BLOCK: Final = 1 << 12
+_LAST_BLOCK: Final = 1 << 20
+"""First and largest block of a search [bytes]: blocks grow, so that dense damage does not make it slow."""
+
 _MAX_SIDE_RECORD: Final = 1 << 26
 
 
@@ -119,16 +125,15 @@ class Scanner:
         if opcode == rec.METADATA:
             name, entries = rec.parse_metadata(body, catalog.extras.most)
             catalog.side_records.add((position, rec.HEAD_SIZE + len(body), name))
-            if (
-                catalog.extras.take(None if entries is None else len(entries), len(body))
-                and entries is not None
-            ):
-                catalog.metadata.append((name, entries))
+            if catalog.extras.take(catalog.extras.most if entries is None else len(entries), len(body)):
+                catalog.metadata.append((name, entries or {}))
             return
         record = rec.parse_record(opcode, body)
         if isinstance(record, Schema | Channel):
-            # Records after the data section belong to the summary, which is rejected when this scan runs.
-            catalog.add_description(record, Cover.DATA if catalog.data_end is None else Cover.SUMMARY)
+            if catalog.data_end is None:
+                catalog.add_description(record, covered=False)
+            else:
+                catalog.repeated.append(record)
         elif isinstance(record, Header):
             catalog.profile, catalog.library = record.profile, record.library
         elif opcode == rec.DATA_END:
@@ -181,27 +186,25 @@ class Scanner:
         ):
             inside = self._find(previous + 1, stop)
             if inside < position:
-                self._drop_message(previous)
+                # The length of the message before is damaged.
+                self._catalog.spans.pop()
+                if previous > last.offset:
+                    self._catalog.spans.append(replace(last, length=previous - last.offset))
                 position, again = previous, inside
         self._note_damage(position, again, stop)
         return again, position
 
-    def _drop_message(self, position: int) -> None:
-        last = self._catalog.spans.pop()
-        if position > last.offset:
-            self._catalog.spans.append(replace(last, length=position - last.offset))
-
     def _find(self, start: int, stop: int) -> int:
-        low, size = start, FIRST_BLOCK
+        low, size = start, _FIRST_BLOCK
         while low <= stop - rec.HEAD_SIZE:
             block = np.frombuffer(self._source.read_at(low, size + rec.HEAD_SIZE - 1), dtype=np.uint8)
             high = min(block.size, stop - low) - rec.HEAD_SIZE + 1
             if high <= 0:
                 break
-            for inner in possible_places(block, 0, high, stop - low, _KNOWN).tolist():
+            for inner in _possible_places(block, high, stop - low).tolist():
                 if self._goes_on(low + inner, stop):
                     return low + int(inner)
-            low, size = low + high, min(2 * size, LAST_BLOCK)
+            low, size = low + high, min(2 * size, _LAST_BLOCK)
         return stop
 
     def _take_cut_chunk(self, position: int, stop: int) -> bool:
@@ -232,154 +235,73 @@ class Scanner:
         self._catalog.losses.append(Loss(kind, text, bytes=end - start, start_ns=self._last_ns))
 
 
+def _possible_places(data: NDArray[np.uint8], high: int, end: int) -> Ints:
+    """Positions below ``high`` whose opcode and length are possible for a record that ends by ``end``."""
+    least = np.full(256, np.iinfo(np.int64).max, dtype=np.int64)
+    least[list(rec.LEAST_BODY)] = list(rec.LEAST_BODY.values())
+    # Most bytes are not an opcode: lengths are checked only after those that may be one.
+    places = np.flatnonzero(data[:high] - np.uint8(1) < np.uint8(len(rec.LEAST_BODY)))
+    heads: NDArray[np.uint64] = np.ndarray((data.size - 8,), "<u8", data, offset=1, strides=(1,))
+    length = heads[places]
+    room = (end - rec.HEAD_SIZE - places).astype(np.uint64)
+    return places[(length <= room) & (length >= least[data[places]].astype(np.uint64))]
+
+
 _STEPS_PER_JUMP: Final = 20
 """Minimum number of increments by one per jump; below it, sequence numbers do not count messages."""
 
-
-_WHOLE_FILE: Final = -1
-"""Channel number for the sequence over all channels, for writers that number all messages together."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Jump:
-    """A gap in the sequence numbers of a channel: offsets of the chunks, numbers and log times [ns]."""
-
-    between: tuple[int, int]
-    before: int
-    after: int
-    start_ns: int
-    end_ns: int
+Numbered: TypeAlias = tuple[Span, NDArray[np.uint16], NDArray[np.uint32], Ints]
+"""A whole chunk with channels, sequence numbers and log times [ns] of its messages."""
 
 
-class _Piece(NamedTuple):
-    """Sequence numbers of one channel in one chunk, and log times [ns] of its first and last message."""
+def find_missing(chunks: Sequence[Numbered], channels: Mapping[int, Channel]) -> list[Loss]:
+    """Losses of messages missing between two chunks, if the writer certainly numbers consecutively.
 
-    size: int
-    steps: int
-    first: int
-    last: int
-    low: int
-    high: int
-    start_ns: int
-    end_ns: int
+    It may number the messages of each channel, or all of a file together. Only chunks that follow one another
+    are compared: damage between them is told already.
 
-
-def _cut(channel: NDArray[np.uint16], sequence: Ints, log_time: Ints) -> Iterator[tuple[int, _Piece]]:
-    """Split messages that are sorted by channel into one piece per channel."""
-    if not channel.size:
-        return
-    low = np.flatnonzero(np.append(True, channel[1:] != channel[:-1]))
-    high = np.append(low[1:], channel.size)
-    by_one = np.append(0, np.diff(sequence) == 1)
-    # The first message of a channel has no predecessor in it.
-    by_one[low] = 0
-    columns = (
-        high - low,
-        np.add.reduceat(by_one, low),
-        sequence[low],
-        sequence[high - 1],
-        np.minimum.reduceat(sequence, low),
-        np.maximum.reduceat(sequence, low),
-        log_time[low],
-        log_time[high - 1],
-    )
-    pieces = map(_Piece, *(column.tolist() for column in columns))
-    yield from zip(channel[low].tolist(), pieces, strict=True)
-
-
-@dataclass(slots=True)
-class _Series:
-    """Sequence numbers of one channel so far.
-
-    Attributes:
-        steps: number of increments by one.
-        regular: whether all other increments are gaps between one chunk and the next.
-        jumps: these gaps.
-        low: smallest number.
-        high: largest number.
-        last: number, log time [ns] and offset of the chunk of the last message; None if unknown.
+    Args:
+        chunks: the chunks in the order of the file.
+        channels: channels by number.
     """
+    if not any(channel.size for _, channel, *_ in chunks):
+        return []
+    spans, *columns = zip(*chunks, strict=True)
+    channel, sequence, time = (np.concatenate(column) for column in columns)
+    sequence = sequence.astype(np.int64)
+    chunk = np.repeat(np.arange(len(spans)), [len(column) for column in columns[0]])
+    apart = [a.offset + a.length + a.index_length != b.offset for a, b in pairwise(spans)]
+    stretch = np.append(0, np.cumsum(apart))[chunk]
 
-    steps: int = 0
-    regular: bool = True
-    jumps: list[_Jump] = field(default_factory=list)
-    low: int = 1 << 32
-    high: int = -1
-    last: tuple[int, int, int] | None = None
+    def find_jumps(rows: Ints) -> Ints | None:
+        """Rows before a jump; None where the numbers do not count."""
+        step, joined = np.diff(sequence[rows]), np.diff(stretch[rows]) == 0
+        by_one, jump = joined & (step == 1), joined & (step > 1) & (np.diff(chunk[rows]) > 0)
+        regular = (by_one | jump | ~joined).all()
+        counts = regular and by_one.sum() >= _STEPS_PER_JUMP * max(1, int(jump.sum()))
+        return np.flatnonzero(jump) if counts else None
 
-    @property
-    def counts(self) -> bool:
-        """Whether the writer certainly numbers messages consecutively."""
-        return self.regular and self.steps >= _STEPS_PER_JUMP * max(1, len(self.jumps))
-
-    def add(self, piece: _Piece, position: int) -> None:
-        """Add the messages of the next chunk."""
-        self.steps += piece.steps
-        self.regular &= piece.steps == piece.size - 1
-        self.low, self.high = min(self.low, piece.low), max(self.high, piece.high)
-        if self.last is not None:
-            number, time, before = self.last
-            step = piece.first - number
-            self.steps += step == 1
-            self.regular &= step >= 1
-            if step > 1:
-                self.jumps.append(_Jump((before, position), number, piece.first, time, piece.start_ns))
-        self.last = piece.last, piece.end_ns, position
-
-
-class SequenceCheck:
-    """Compares the sequence numbers of messages between successive chunks."""
-
-    def __init__(self) -> None:
-        self._series: dict[int, _Series] = {}
-        self._end: int | None = None
-
-    def add(self, span: Span, loaded: Loaded) -> None:
-        """Add the next span of the file; losses in it or before it explain missing messages."""
-        if span.kind is not SpanKind.CHUNK or loaded.losses or span.offset != self._end:
-            for series in self._series.values():
-                series.last = None
-        self._end = None
-        if span.kind is SpanKind.CHUNK and not loaded.losses:
-            self._end = span.offset + span.length + span.index_length
-            messages = loaded.messages
-            sequence = messages.sequence.astype(np.int64)
-            everything = np.zeros(sequence.size, dtype=np.uint16)
-            order = np.argsort(messages.channel, kind="stable")
-            pieces = [
-                *((_WHOLE_FILE, piece) for _, piece in _cut(everything, sequence, messages.log_time)),
-                *_cut(messages.channel[order], sequence[order], messages.log_time[order]),
-            ]
-            for number, piece in pieces:
-                self._series.setdefault(number, _Series()).add(piece, span.offset)
-
-    def find_losses(self, channels: Mapping[int, Channel]) -> list[Loss]:
-        """Losses of messages missing between two chunks, if the writer certainly numbers consecutively.
-
-        Args:
-            channels: channels by number.
-        """
-        together = self._series.pop(_WHOLE_FILE, _Series())
-        counting = {_WHOLE_FILE: together} if together.counts else self._series
-        # Numbers that another channel may have used are no gap: the writer may number both together.
-        other = [series for series in self._series.values() if not series.counts and not together.counts]
-        jumps_of: dict[tuple[int, int], dict[int, _Jump]] = {}
-        for number, series in counting.items():
-            for jump in series.jumps if series.counts else ():
-                if all(each.high <= jump.before or each.low >= jump.after for each in other):
-                    jumps_of.setdefault(jump.between, {})[number] = jump
-        return [_note_jumps(position, jumps, channels) for position, jumps in sorted(jumps_of.items())]
-
-
-def _note_jumps(
-    position: tuple[int, int], jumps: Mapping[int, _Jump], channels: Mapping[int, Channel]
-) -> Loss:
-    missing = sum(jump.after - jump.before - 1 for jump in jumps.values())
-    topics = [channels[number].topic for number in jumps if number in channels]
-    listed = name_first(topics)
-    text = (
-        f"{missing} messages{f' of {listed}' if listed else ''} are missing between the chunks at "
-        f"{position[0]} and {position[1]}: their numbers, which count by one everywhere else, jump there"
-    )
-    start, end = (min(jump.start_ns for jump in jumps.values()), max(jump.end_ns for jump in jumps.values()))
-    return Loss("missing_messages", text, start_ns=start, end_ns=end)
+    every = np.arange(channel.size)
+    is_common = find_jumps(every) is not None
+    jumps_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    series = [every] if is_common else group_rows(channel)
+    judged = [(rows, find_jumps(rows)) for rows in series]
+    # Numbers that another channel may have used are no gap: the writer may number both together.
+    ranges = [(sequence[rows].min(), sequence[rows].max()) for rows, jumps in judged if jumps is None]
+    for rows, jumps in judged:
+        for a, b in () if jumps is None else zip(rows[jumps].tolist(), rows[jumps + 1].tolist(), strict=True):
+            if all(high <= sequence[a] or low >= sequence[b] for low, high in ranges):
+                jumps_of.setdefault((chunk[a], chunk[b]), []).append((a, b))
+    losses = []
+    for (before, after), pairs in sorted(jumps_of.items()):
+        missing = sum(int(sequence[b] - sequence[a]) - 1 for a, b in pairs)
+        numbers = [] if is_common else [int(channel[a]) for a, _ in pairs]
+        listed = name_first([channels[number].topic for number in numbers if number in channels])
+        text = (
+            f"{missing} messages{f' of {listed}' if listed else ''} are missing between the chunks at "
+            f"{spans[before].offset} and {spans[after].offset}: their numbers, which count by one everywhere "
+            "else, jump there"
+        )
+        start, end = min(int(time[a]) for a, _ in pairs), max(int(time[b]) for _, b in pairs)
+        losses.append(Loss("missing_messages", text, start_ns=start, end_ns=end))
+    return losses

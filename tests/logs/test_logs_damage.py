@@ -225,16 +225,47 @@ def test_a_damaged_chunk_that_ends_in_zeros_is_not_a_cut_one(tmp_path: Path) -> 
             assert columns.fields["pose.pose.position.x"].tolist() == (rows * 0.25).tolist()
 
 
-def test_a_chunk_whose_end_was_never_written_is_read_up_to_there(tmp_path: Path) -> None:
+def test_a_chunk_whose_end_was_never_written_is_lost_and_told(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     truth = write_small(path, compression="")
     content = path.read_bytes()
     start, end = chunk_places(content)[4]
     cut = (start + end) // 2
     found, losses = read_damaged(path, content[:cut] + bytes(end - cut + 100) + content[end + 100 :], truth)
-    assert "truncated" in losses
-    before, _ = read_damaged(path, content[:start], truth)
-    assert len(found) > len(before)
+    assert "chunk_crc" in losses
+    first, last = struct.unpack_from("<QQ", content, start + 9)
+    assert found == {key: value for key, value in truth.items() if not first <= key[1] <= last}
+
+
+def test_without_a_checksum_the_rest_of_a_damaged_chunk_is_lost_and_told(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_official(path, enable_crcs=False, compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    start, end = chunk_places(bytes(content))[4]
+    first, last = struct.unpack_from("<QQ", content, start + 9)
+    places = [start + 49]
+    while places[-1] < end:
+        places.append(places[-1] + 9 + struct.unpack_from("<Q", content, places[-1] + 1)[0])
+    middle = places[len(places) // 2]
+    content[middle : middle + 9] = b"\xee" * 9
+    path.write_bytes(content)
+    data, found = read_small(path)
+    (loss,) = data.losses
+    assert (loss.kind, loss.chunks, loss.bytes, loss.end_ns) == ("damaged_record", 1, end - middle, last)
+    assert first <= (loss.start_ns or 0) <= last
+    assert found.keys() >= {key for key in truth if key[1] <= (loss.start_ns or 0) or key[1] > last}
+    assert found.items() <= truth.items()
+
+
+def test_where_the_summary_is_cut_its_records_name_what_a_damaged_chunk_named(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    truth = write_small(path)
+    content = bytearray(path.read_bytes()[:-60])
+    start, end = chunk_places(path.read_bytes())[0]
+    content[(start + end) // 2] ^= 0xFF
+    found, losses = read_damaged(path, bytes(content), truth)
+    assert len(found) > len(truth) // 2
+    assert "unknown_channel" not in losses
 
 
 def test_a_damaged_chunk_names_its_time(tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def none(_own: int, _all: int) -> int:
     return 0
 
 
-@pytest.mark.parametrize(("number", "topics"), [(by_channel, " of /fast, /slow"), (together, "")])
+@pytest.mark.parametrize(("number", "topics"), [(by_channel, " of /fast and /slow"), (together, "")])
 def test_a_chunk_that_is_missing_is_said_with_its_times(
     tmp_path: Path, number: Callable[[int, int], int], topics: str
 ) -> None:
