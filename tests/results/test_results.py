@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from drawn_diagnoses import draw_diagnosis
 
+from pipeline.core import SlipError
 from pipeline.results import (
     DataNeed,
     Finding,
@@ -104,7 +105,7 @@ def test_a_diagnosis_of_an_earlier_version_is_read_with_what_it_has() -> None:
 
 
 def test_a_file_that_is_no_diagnosis_is_refused() -> None:
-    with pytest.raises(msgspec.ValidationError, match="ladder"):
+    with pytest.raises(SlipError, match="ladder"):
         read_result({"ladder": 5}, RunDiagnosis)
 
 

@@ -34,7 +34,8 @@ def list_numbers(kind: msgspec.inspect.Type, keys: tuple[str, ...] = ()) -> Iter
         elif isinstance(one, msgspec.inspect.ListType):
             yield from list_numbers(one.item_type, (*keys, "[]"))
         elif isinstance(one, msgspec.inspect.DictType):
-            yield from list_numbers(one.value_type, (*keys, "left"))
+            names = getattr(one.key_type, "values", ["left"])
+            yield from list_numbers(one.value_type, (*keys, str(names[0])))
 
 
 CONFIGURED = list(list_numbers(msgspec.inspect.type_info(Configuration)))
