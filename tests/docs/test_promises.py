@@ -32,7 +32,7 @@ ASKED = {
     "compare": (),
     "check": ("field/wide", "field/other"),
     "plan": ("field/wide", "--time", "60s"),
-    "fleet fit": (),
+    "fleet show": (),
     "fleet trend": (),
     "batch": ("field", "--settle", "0"),
     "results status": (),
