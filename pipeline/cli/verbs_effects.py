@@ -102,7 +102,7 @@ class Diagnosed:
     """Diagnoses of logs as they come.
 
     Attributes:
-        limit: the memory limit, which is told what is being worked on.
+        limit: the memory limit, which names the present log.
         answers: one for runs that were judged together.
         errors: errors as JSON objects; each affects only one log.
         lossy: logs with losses.
