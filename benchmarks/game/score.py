@@ -5,8 +5,8 @@
 ANSWERS is a folder of <task>.json, TRUTHS the folder of <ring>/<task>.json that the maker of the rings holds.
 A truth counts only if its SHA-256 is the one that its task was published with. An answer that is missing or
 broken counts as abstained, with one line on the error stream. Every score has its 95 % interval over tasks
-(bootstrap of 2,000 resamples). The rules are those of the page docs/pages/hidden_effect.md. Exit code 0; 1
-where there is nothing to score with.
+(bootstrap of 2,000 resamples). The rules are those of benchmarks/game/hidden_effect.md. Exit code 0; 1 where
+there is nothing to score with.
 """
 
 import argparse

@@ -502,7 +502,7 @@ class _Database:
     def _list_topics(self) -> list[_Topic]:
         tables = {name for (name,) in self._query("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
-            raise InflateError("it is a database without the tables of a recording")
+            raise InflateError("not a recording: tables are missing from the database")
         described = "SELECT hidden FROM sqlite_master, pragma_table_xinfo(sqlite_master.name)"
         if _COMPUTED & {hidden for (hidden,) in self._query(described)}:
             raise InflateError("its tables have computed columns, which no recorder writes")
