@@ -59,6 +59,7 @@ def test_a_number_of_two_digits_has_two_after_rounding(value: float, text: str) 
     assert format_two(value) == text
 
 
+@pytest.mark.lint
 def test_no_module_writes_percent_by_itself() -> None:
     """`{share:.0%}` has no space before the sign."""
     found = [

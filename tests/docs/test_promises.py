@@ -105,6 +105,7 @@ def test_the_names_of_python_are_there(name: str) -> None:
     assert name in slip.__all__
 
 
+@pytest.mark.lint
 def test_the_version_is_the_same_everywhere() -> None:
     (version,) = re.findall(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()

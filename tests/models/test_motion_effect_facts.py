@@ -47,6 +47,7 @@ def list_mentions(path: Path) -> list[str]:
     return found
 
 
+@pytest.mark.lint
 def test_no_generic_file_knows_an_effect() -> None:
     knowing = {
         name: [line for line in list_mentions(path) if line.split(": ")[1] not in NAMESAKES.get(name, ())]

@@ -10,7 +10,6 @@ from pipeline.estimation import EstimationData, Input
 from pipeline.estimation.fit import fit_path
 from pipeline.estimation.path_residuals import weigh_runs
 from pipeline.models import find_effect
-from pipeline.plan.next_drive import read_values
 from pipeline.simulate import VEHICLES, Program
 
 WARTHOG = vehicle_of("warthog")
@@ -111,21 +110,3 @@ def test_a_number_of_the_ground_is_one_on_each_ground_and_the_vehicles_is_one_on
     lag = fit_path(drive, data.start_state([find_effect("turn_lag")(tau_diff=0.5)]))
     assert not lag.state.own
     assert lag.state.effects[0].values["tau_diff"] == pytest.approx(0.3, abs=0.02)
-
-
-def test_a_terrain_that_was_never_driven_is_expected_to_be_like_most_of_the_others() -> None:
-    """Ice is unlike every other ground: the mean over grounds would be none of them."""
-    tracks = {"gravel": 1.7, "asphalt": 1.72, "grass": 1.71, "ice": 2.4}
-    runs = [
-        replace(
-            simulate({"effective_track": {"k": k}}, seed=seed, duration_s=60.0, vehicle=VEHICLES["warthog"]),
-            terrain=terrain,
-        )
-        for seed, (terrain, k) in enumerate(tracks.items())
-    ]
-    data = EstimationData(runs, WARTHOG, Input.MEASURED)
-    (body,) = data.paths
-    fit = fit_path(body, data.start_state([find_effect("effective_track")(k=1.8)]))
-    expected = {terrain: read_values(data, [fit], terrain) for terrain in ("mud", "ice")}
-    assert expected["mud"]["effective_track.k"] == pytest.approx(1.715, rel=0.01)
-    assert expected["ice"]["effective_track.k"] == pytest.approx(2.4, rel=0.01)

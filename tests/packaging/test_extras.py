@@ -100,6 +100,7 @@ def test_what_is_there_is_not_refused() -> None:
         require_package("no_such_package", "diagnose", "this")
 
 
+@pytest.mark.lint
 def test_the_extras_of_the_handbook_are_those_of_the_wheel() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
@@ -110,6 +111,7 @@ def test_the_extras_of_the_handbook_are_those_of_the_wheel() -> None:
     assert {extra for extra in named if f"`[{extra}]`" in page} == named
 
 
+@pytest.mark.lint
 def test_the_recipe_of_conda_needs_what_the_wheel_needs() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     recipe = yaml.safe_load((ROOT / "packaging" / "conda.yaml").read_text())
