@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 MODELS = write_models()
 
 
+@pytest.mark.long
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_text_is_read_or_refused_in_one_line(tmp_path: Path, seed: int) -> None:
