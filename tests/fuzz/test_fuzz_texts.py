@@ -3,6 +3,7 @@
 import random
 from pathlib import Path
 
+import pytest
 from fuzz_texts import (
     CONFIGURATION,
     FORMULAS,

@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import cast
 
+import pytest
 from chrome import LAPTOP, PHONE, Chrome
 from workbench_server import ERROR, RUN, SHOWN, Workbench, look_for_trouble
 
