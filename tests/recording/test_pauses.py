@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from few import few
 
 from pipeline.core import Floats
 from pipeline.recording.geometry import roll_wheels
@@ -91,7 +92,7 @@ def test_the_interval_of_few_pauses_holds_the_time_out(silences: int, stops: int
     assert np.mean(held) > 0.9
 
 
-@pytest.mark.parametrize("timeout_s", [0.3, 0.5, np.inf])
+@pytest.mark.parametrize("timeout_s", few([0.3, 0.5, np.inf], 2))
 @pytest.mark.parametrize("period_s", [1.0, 2.0])
 def test_a_base_that_waits_less_than_its_commander_drives_in_bursts(
     period_s: float, timeout_s: float

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+from few import few
 from verbs import run_slip
 from workbench_server import RUN, TRACK, Workbench
 
@@ -218,7 +219,7 @@ UNUSUAL = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("unusual", UNUSUAL, ids=lambda case: str(case)[:50])
+@pytest.mark.parametrize("unusual", few(UNUSUAL, 6), ids=lambda case: str(case)[:50])
 def test_whatever_formula_is_written_the_session_stays_usable(
     shared_workbench: Workbench, unusual: dict[str, str]
 ) -> None:
