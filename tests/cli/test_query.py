@@ -8,7 +8,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from verbs import run_program, run_slip
+from verbs import run_slip
 
 from pipeline.cli import verbs_results
 from pipeline.core import python_command
@@ -179,6 +179,4 @@ def test_a_reader_of_the_answer_may_leave(out: Path) -> None:
 
 def test_texts_that_are_formulas_are_none_in_csv(out: Path) -> None:
     sql = 'SELECT dataset, terrain, t_start, 1 AS "=x" FROM windows LIMIT 1'
-    done = run_program("results", "query", sql, "--results", out, "--to", "csv")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == "dataset,terrain,t_start,'=x\n'=d,'-ice,-1.5,1\n"
+    assert ask(out, sql, "--to", "csv") == (0, "dataset,terrain,t_start,'=x\n'=d,'-ice,-1.5,1\n", "")
