@@ -239,12 +239,9 @@ def test_wheels_of_a_known_vehicle_that_read_three_times_too_fast_are_told(tmp_p
 
 @pytest.mark.parametrize(
     "names",
-    few(
-        [("steering_joint", "traction_joint"), ("front_steer", "front_wheel"), ("azimuth_1", "drive_motor")],
-        3,
-    ),
+    [("steering_joint", "traction_joint"), ("front_steer", "front_wheel"), ("azimuth_1", "drive_motor")],
 )
-@pytest.mark.parametrize("commanded", [False, True])
+@pytest.mark.parametrize("commanded", few([False, True], 2))
 def test_a_wheel_that_steers_and_drives_is_a_tricycle(
     names: tuple[str, str], tmp_path: Path, *, commanded: bool
 ) -> None:
