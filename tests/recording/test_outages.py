@@ -84,7 +84,7 @@ def test_an_encoder_that_dies_early_is_found() -> None:
 
 
 def test_wheels_that_follow_are_never_left_out() -> None:
-    for seed in range(30, 40):
+    for seed in range(30, 34):
         drive = draw(seed)
         assert look(drive, sides(drive)) == []
 

@@ -144,9 +144,10 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
     assert errors == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("width", "dark"),
-    [(PHONE, False), pytest.param(LAPTOP, True, marks=pytest.mark.long)],
+    [(PHONE, False), (LAPTOP, True)],
     ids=["phone", "laptop-dark"],
 )
 def test_nothing_is_cut_or_overlaps(

@@ -111,14 +111,12 @@ def test_a_report_is_shut_off_from_the_page_that_links_to_it(workbench: Workbenc
     assert "allow-same-origin" not in policy[0]
 
 
-@pytest.mark.parametrize(
-    "host", ["evil.example", "127.0.0.1.evil.example", "[::2]:80", "", "localhost.evil:1"]
-)
-def test_a_name_that_points_here_from_elsewhere_is_refused(workbench: Workbench, host: str) -> None:
-    for path in ("/", "/api/runs"):
-        status, _, body = workbench.request("GET", path, headers={"Host": host})
-        assert status in {400, 403}
-        assert b"runs" not in body
+def test_a_name_that_points_here_from_elsewhere_is_refused(workbench: Workbench) -> None:
+    for host in ["evil.example", "127.0.0.1.evil.example", "[::2]:80", "", "localhost.evil:1"]:
+        for path in ("/", "/api/runs"):
+            status, _, body = workbench.request("GET", path, headers={"Host": host})
+            assert status in {400, 403}
+            assert b"runs" not in body
 
 
 @pytest.mark.parametrize(
@@ -140,10 +138,10 @@ def test_on_all_addresses_a_phone_gets_in_by_any_address_and_no_name_does(
         assert (answer is None) is expected
 
 
-@pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "LOCALHOST"])
-def test_the_loopback_by_any_of_its_names_is_let_in(workbench: Workbench, host: str) -> None:
-    status, _, _ = workbench.request("GET", "/api/runs", headers={"Host": f"{host}:{workbench.port}"})
-    assert status == 200
+def test_the_loopback_by_any_of_its_names_is_let_in(workbench: Workbench) -> None:
+    for host in ["localhost", "127.0.0.1", "[::1]", "LOCALHOST"]:
+        status, _, _ = workbench.request("GET", "/api/runs", headers={"Host": f"{host}:{workbench.port}"})
+        assert status == 200
 
 
 def test_another_origin_is_refused(workbench: Workbench) -> None:
