@@ -123,6 +123,7 @@ def test_a_husky_that_stands_on_a_plank_is_not_moving_and_its_encoders_say_zero(
     assert measured["median_modulus"] < 0.01
 
 
+@pytest.mark.long
 def test_snow_commands_are_off_by_the_ratio_of_two_radii(recorded_results: Path) -> None:
     summary = analyze_log(
         LOGS / "husky_snow_boreal.mcap", Options(out=recorded_results, report=False)
