@@ -84,14 +84,6 @@ def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None
     assert done.returncode == 0, done.stderr
     assert out.is_file()
 
-    twice = ["drive_lag=tau:1,tau:2"], ["drive_lag=0.3", "drive_lag=0.5"]
-    for effects in (["effective_track=wide"], ["antigravity=1"], *twice):
-        asked = [word for effect in effects for word in ("--effect", effect)]
-        wrong = run_verb("simulate", "ideal_husky", *asked, "--file", tmp_path / "x.mcap")
-        assert wrong.returncode == 1
-        assert len(wrong.stderr.splitlines()) == 1
-        assert not (tmp_path / "x.mcap").exists()
-
 
 def test_a_diagnosis_of_a_damaged_log_says_why_it_ends_with_3(tmp_path: Path) -> None:
     log = simulate_case("husky_tile", out=tmp_path / "whole.mcap", duration_s=60.0)

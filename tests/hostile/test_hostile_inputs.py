@@ -98,6 +98,7 @@ WORDS: list[tuple[str, str]] = [
     *((f"plan --vehicle husky_a200 --area {area}", "--area") for area in ("20", "0x5m", "ax3", "20x10km")),
     ("simulate husky_til --file x.mcap", "husky_tile"),
     ("simulate ideal_husky --effect effective_trak=1 --file x.mcap", "effective_track"),
+    ("simulate ideal_husky --effect antigravity=1 --file x.mcap", "antigravity"),
     ("simulate ideal_husky --effect effective_track=kk:1.8 --file x.mcap", "kk"),
     ("simulate ideal_husky --effect effective_track=wide --file x.mcap", "wide"),
     ("simulate ideal_husky --effect lever_arm=.1 --file x.mcap", "l_x, l_y"),

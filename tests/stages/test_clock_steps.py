@@ -137,6 +137,7 @@ def find_effects(taken: Taken, tables: dict[str, pl.DataFrame]) -> tuple[set[str
     return {effect.id for effect in run.effects}, peaks
 
 
+@pytest.mark.long
 def test_no_array_is_sized_by_a_hole(drive: TakeThrough) -> None:
     taken = drive(replace(FIELD, duration_s=40.0))
     effects, peaks = find_effects(taken, hold_open(taken, 0.0))
