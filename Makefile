@@ -49,7 +49,7 @@ test: $(VENV)/.ready-dev ## the fast tests
 	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || \
 		echo "no Chromium here: tests that look at pages are left out (make browser)" >&2
 	@# Compiled tests are kept where the environment forbids it, too: to compile them takes 15 s per process.
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist worksteal -m "not long" --durations=25
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist worksteal -m "not long and not lint" --durations=25
 
 clean: ## remove the environment and caches; results stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis dist build
@@ -57,16 +57,17 @@ clean: ## remove the environment and caches; results stay
 
 ##@ For developers
 
-check: $(VENV)/.ready-dev ## style, types, and layers of imports
+check: $(VENV)/.ready-dev ## style, types, layers of imports; words, names and links
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python benchmarks/house.py
+	$(BIN)/python -m pytest -m "lint and not long"
 
 test-long: $(VENV)/.ready-dev ## the tests that take minutes
-	$(BIN)/python -m pytest -n 2 -m long
-	$(BIN)/python -m pytest -n 2 -m "not long" --hypothesis-profile many tests/fuzz
+	$(BIN)/python -m pytest -n 2 -m long --ignore tests/fuzz
+	$(BIN)/python -m pytest -n 2 --hypothesis-profile many tests/fuzz
 
 bench: $(VENV)/.ready-dev ## the benchmarks; NAME=reader: one of them [ARGS="--help"]
 	@# Some systems have a NAME in the environment: only one that was given to make counts.

@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 import polars as pl
 import pytest
+from few import few
 from stage_logs import PLAIN
 from verbs import print_verb, run_slip, run_verb
 
@@ -178,13 +179,16 @@ def test_runs_with_and_without_a_pose_are_not_judged_together(unknown: Analyzed,
 
 @pytest.mark.parametrize(
     ("layout", "vehicle", "effects"),
-    [
-        ("husky_body_command", "husky", {"drive_lag": 0.3, "drive_gain": 0.9}),
-        ("husky", "husky", {"drive_lag": 0.3, "transport_delay": 0.15}),
-        ("ackermann", "car", {"drive_lag": 0.3, "steering_lag": 0.2}),
-        ("ackermann_status", "car", {"drive_lag": 0.3}),
-        ("mecanum", "youbot", {"drive_lag": 0.3}),
-    ],
+    few(
+        [
+            ("husky_body_command", "husky", {"drive_lag": 0.3, "drive_gain": 0.9}),
+            ("husky", "husky", {"drive_lag": 0.3, "transport_delay": 0.15}),
+            ("ackermann", "car", {"drive_lag": 0.3, "steering_lag": 0.2}),
+            ("ackermann_status", "car", {"drive_lag": 0.3}),
+            ("mecanum", "youbot", {"drive_lag": 0.3}),
+        ],
+        3,
+    ),
     ids=["body command", "wheel command", "car", "steering at once", "mecanum"],
 )
 def test_a_known_vehicle_shows_every_effect_of_its_drive(
@@ -198,7 +202,7 @@ def test_a_known_vehicle_shows_every_effect_of_its_drive(
         assert contains(number, truth), name
 
 
-@pytest.mark.parametrize("layout", ["wheel_float", "ackermann"])
+@pytest.mark.parametrize("layout", few(["wheel_float", "ackermann"], 2))
 def test_commands_of_the_wheels_themselves_need_no_geometry(tmp_path: Path, layout: str) -> None:
     vehicle = "car" if layout == "ackermann" else "turtlebot3"
     log = record(make(layout, vehicle, {"drive_lag": 0.3}), tmp_path / "run.mcap")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from few import few
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -25,7 +26,7 @@ def every_other(time: Floats) -> Floats:
     return np.where(np.arange(time.size) % 2, np.nan, 0.0)
 
 
-@pytest.mark.parametrize(("report", "lose"), [("velocity", fall_silent), ("position", every_other)])
+@pytest.mark.parametrize(("report", "lose"), few([("velocity", fall_silent), ("position", every_other)], 2))
 def test_an_unknown_vehicle_is_fitted_without_readings_that_are_missing(
     lose: Callable[[Floats], Floats], report: str, tmp_path: Path
 ) -> None:

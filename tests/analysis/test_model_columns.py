@@ -1,6 +1,7 @@
 """Model against measurement per time step: the model columns of table `slip` after a diagnosis."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,30 +11,27 @@ from verbs import run_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store.parquet_tables import read_facts
 
 COLUMNS = ["model_x", "model_y", "model_w", "residual_modulus"]
-TAU_S, TRACK = 0.3, 1.8
 
 
 def analyze(log: Path, out: Path, **options: object) -> Outcome:
     return analyze_log(log, Options(out=out, **{"report": False, "diagnosis": True, **options}))
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def log(stored_run: Path) -> Path:
     """A Husky that turns too little and answers late."""
-    hidden = {"effective_track": {"k": TRACK}, "drive_lag": {"tau": TAU_S}}
-    folder = tmp_path_factory.mktemp("known")
-    return simulate_case("ideal_husky", hidden, out=folder / "known.mcap", duration_s=90.0)
+    return stored_run / "field" / "wide.mcap"
 
 
 @pytest.fixture(scope="module")
-def known(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+def known(log: Path, stored_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """That log, analyzed with a diagnosis."""
-    return analyze(log, tmp_path_factory.mktemp("results"))
+    results = tmp_path_factory.mktemp("known") / "results"
+    return analyze(log, Path(shutil.copytree(stored_run / "results", results, symlinks=True)))
 
 
 def test_the_model_that_was_judged_stands_beside_the_measurement(known: Outcome) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from few import few
 from platforms import hidden_effects, try_platform
 from simulated_platforms import PLATFORMS, simulate_platform
 
@@ -151,7 +152,7 @@ def record(name: str, folder: Path, duration_s: float = 20.0) -> Choice:
     return choose(open_log(log), load_configuration(log), {})
 
 
-@pytest.mark.parametrize("name", PLATFORMS)
+@pytest.mark.parametrize("name", few(PLATFORMS, 5))
 def test_topics_and_vehicle_of_a_platform_are_chosen_without_configuration(name: str, tmp_path: Path) -> None:
     chosen = record(name, tmp_path)
     roles = (chosen.sources.command, chosen.sources.wheels, chosen.sources.pose)

@@ -19,6 +19,7 @@ from pipeline.analysis.analyze import analyze_log
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
+@pytest.mark.long
 def test_a_folder_of_tables_becomes_a_log_by_the_script_of_the_examples(tmp_path: Path) -> None:
     session, log = write_session(tmp_path / "red_2025-10-14-11-41"), tmp_path / "session.mcap"
     subprocess.run([sys.executable, EXAMPLES / "tables_to_mcap.py", session, log], check=True)

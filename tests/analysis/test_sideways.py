@@ -5,6 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from few import few
 from simulated_platforms import PLATFORMS, scene_of, simulate_platform
 
 from pipeline.analysis import Options
@@ -71,7 +72,7 @@ def test_an_effect_that_costs_a_settled_heading_a_thousandth_stands_on_the_ladde
         assert all(rung[key] <= 1.01 * below[key] for key in ("t_mrmse_m", "r_mrmse_rad"))
 
 
-@pytest.mark.parametrize("name", ["panther", "rosbot_xl"])
+@pytest.mark.parametrize("name", few(["panther", "rosbot_xl"], 2))
 @pytest.mark.parametrize(("fastest_mps", "wheels"), [(0.0, ""), (0.8, "_mecanum")], ids=["tyres", "mecanum"])
 def test_a_platform_with_two_sets_of_wheels_is_told_by_what_it_is_asked(
     name: str, fastest_mps: float, wheels: str, tmp_path: Path

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -177,9 +176,8 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
     assert repr(diagnosis).startswith(f"{diagnosis.verdict}\n")
 
 
-@pytest.mark.parametrize(
-    ("act", "line"),
-    [
+def test_what_is_wrong_is_said_in_one_line(run: slip.Run) -> None:
+    for act, line in [
         (lambda _: slip.effect("effectiv_track"), "no effect is called 'effectiv_track'"),
         (lambda _: slip.effect(EFFECT, k="wide"), "'wide' is not a value of k"),
         (lambda _: slip.effect("mine", v_y="k *", k=("m/s", -1, 1)), "is not a formula"),
@@ -202,16 +200,12 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
         (lambda run: run.table("tables"), "hold no 'tables'"),
         (lambda run: slip.load("monday", results=find_results(run)), "there is no run 'monday'"),
         (lambda run: slip.Model("warthog").fit(run), "the run is of a Clearpath Husky A200"),
-    ],
-)
-def test_what_is_wrong_is_said_in_one_line(
-    act: Callable[[slip.Run], object], line: str, run: slip.Run
-) -> None:
-    with pytest.raises(slip.SlipError) as error:
-        act(run)
-    (shown,) = error.value._render_traceback_()
-    assert line in shown
-    assert "\n" not in shown
+    ]:
+        with pytest.raises(slip.SlipError) as error:
+            act(run)
+        (shown,) = error.value._render_traceback_()
+        assert line in shown
+        assert "\n" not in shown
 
 
 def test_what_a_log_lost_is_said(run: slip.Run, tmp_path: Path) -> None:

@@ -80,6 +80,7 @@ def kill_first_worker(begun: Path, killed: list[int]) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.long
 def test_a_worker_killed_in_the_middle_costs_nothing(scheduler: str, season: Path, tmp_path: Path) -> None:
     batch(season, tmp_path / "here")
     killed: list[int] = []

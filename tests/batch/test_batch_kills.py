@@ -220,6 +220,7 @@ def list_group(group: int) -> list[int]:
     return found
 
 
+@pytest.mark.long
 def test_two_batches_at_once_do_every_log_once(
     field: Path, tmp_path: Path, undisturbed: dict[str, bytes]
 ) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import damage_season
 import pytest
 from damage_season import KINDS, NO_TEXT, cut_in_future, run_batch
+from few import few
 from verbs import ask_verb, run_slip
 
 from pipeline.batch.recordings import find_recordings
@@ -57,7 +58,7 @@ def test_each_alone_costs_itself_and_nothing_else(capsys: pytest.CaptureFixture[
     assert damage_season.main() == 0, capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["a pipe", "a link to a device", "a socket"])
+@pytest.mark.parametrize("name", few(["a pipe", "a link to a device", "a socket"], 3))
 def test_nothing_but_files_is_opened(name: str, season: Path, tmp_path: Path) -> None:
     KINDS[name].make(tmp_path, season / "a.mcap")
     with pytest.raises(LogError, match=r"pipe, a socket or a device|cannot be opened"):

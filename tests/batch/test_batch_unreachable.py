@@ -4,6 +4,7 @@ import socket
 import time
 
 import pytest
+from few import few
 from verbs import run_slip
 
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
@@ -49,12 +50,12 @@ def run(*arguments: str) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", few(VERBS, 3))
 def test_without_credentials(verb: str) -> None:
     assert "Unable to locate credentials" in run(*VERBS[verb])
 
 
-@pytest.mark.parametrize("verb", ["batch", "inspect"])
+@pytest.mark.parametrize("verb", few(["batch", "inspect"], 2))
 def test_without_anybody_at_the_address(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as place:
         place.bind(("127.0.0.1", 0))

@@ -1,15 +1,13 @@
 """A value and its interval as text: the digits are those that the interval supports."""
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core import format_interval, split_interval
 
 
-@pytest.mark.parametrize(
-    ("value", "low", "high", "unit", "text"),
-    [
+def test_digits_follow_the_interval() -> None:
+    for value, low, high, unit, text in [
         (14.4012, 14.3782, 14.4242, "rad/s", "14.401 rad/s [14.378, 14.424]"),
         (1.30028, 1.2994, 1.3011, "1", "1.3003 [1.2994, 1.3011]"),
         (0.24412, 0.2311, 0.2571, "s", "0.244 s [0.231, 0.257]"),
@@ -19,12 +17,8 @@ from pipeline.core import format_interval, split_interval
         (0.0, -0.02, 0.02, "m", "0.000 m [-0.020, 0.020]"),
         (2.0, 2.0, 2.0, "1", "2 [2, 2]"),
         (0.45, 0.444, 0.455, None, "0.450 [0.444, 0.455]"),
-    ],
-)
-def test_digits_follow_the_interval(
-    value: float, low: float, high: float, unit: str | None, text: str
-) -> None:
-    assert format_interval(value, low, high, unit) == text
+    ]:
+        assert format_interval(value, low, high, unit) == text
 
 
 @given(

@@ -50,30 +50,55 @@ def test_a_name_stays_inside_or_is_refused(name: str) -> None:
     assert path != ROOT
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "", ".", "..", "../x", "a/..", "a/../../x", "/x", "//x", "a//b", "a/", "C:\\x", "c:x", "a\\b",
-        "\\\\host\\x", "a\0", "a\nb", "\uff0e\uff0e/x", "\u2025", ". ./x", " ", "...", "x" * 256,
-        "/".join(["x" * 200] * 30), "\udcff", "\uff21\uff1a/x", ".\u200b.",
-    ],
-)  # fmt: skip
-def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
-    if name == ". ./x":
-        # A part of its own with a space in its middle is an odd name, but a name.
-        assert resolve_inside(ROOT, "a. .b/x") == ROOT / "a. .b/x"
-    with pytest.raises(PathError) as caught:
-        resolve_inside(ROOT, name)
-    assert caught.value.code == "path_outside"
-    assert len(str(caught.value).splitlines()) == 1
+def test_names_that_lead_elsewhere_are_refused() -> None:
+    for name in [
+        "",
+        ".",
+        "..",
+        "../x",
+        "a/..",
+        "a/../../x",
+        "/x",
+        "//x",
+        "a//b",
+        "a/",
+        "C:\\x",
+        "c:x",
+        "a\\b",
+        "\\\\host\\x",
+        "a\0",
+        "a\nb",
+        "\uff0e\uff0e/x",
+        "\u2025",
+        ". ./x",
+        " ",
+        "...",
+        "x" * 256,
+        "/".join(["x" * 200] * 30),
+        "\udcff",
+        "\uff21\uff1a/x",
+        ".\u200b.",
+    ]:
+        if name == ". ./x":
+            # A part of its own with a space in its middle is an odd name, but a name.
+            assert resolve_inside(ROOT, "a. .b/x") == ROOT / "a. .b/x"
+        with pytest.raises(PathError) as caught:
+            resolve_inside(ROOT, name)
+        assert caught.value.code == "path_outside"
+        assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["a", "runs/2026-07/husky 3/manifest.json", "é/Ωmega.mcap", "a..b", ".hidden", "x" * 255, "10:32/a"],
-)
-def test_plain_names_are_what_they_say(name: str) -> None:
-    assert resolve_inside(ROOT, name) == ROOT / name
+def test_plain_names_are_what_they_say() -> None:
+    for name in [
+        "a",
+        "runs/2026-07/husky 3/manifest.json",
+        "é/Ωmega.mcap",
+        "a..b",
+        ".hidden",
+        "x" * 255,
+        "10:32/a",
+    ]:
+        assert resolve_inside(ROOT, name) == ROOT / name
 
 
 @given(NAMES)

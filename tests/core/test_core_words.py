@@ -11,9 +11,8 @@ from pipeline.core import format_part, format_share, format_two
 PIPELINE = Path(__file__).parents[2] / "pipeline"
 
 
-@pytest.mark.parametrize(
-    ("share", "digits", "text"),
-    [
+def test_a_share_is_percent_with_a_space() -> None:
+    for share, digits, text in [
         (0.56, 2, "56 %"),
         (0.6, 3, "60 %"),
         (0.986, 3, "98.6 %"),
@@ -27,10 +26,8 @@ PIPELINE = Path(__file__).parents[2] / "pipeline"
         (0.0006, 0, "0 %"),
         (0.505, 0, "50 %"),
         (math.inf, 2, "inf %"),
-    ],
-)
-def test_a_share_is_percent_with_a_space(share: float, digits: int, text: str) -> None:
-    assert format_share(share, digits) == text
+    ]:
+        assert format_share(share, digits) == text
 
 
 def test_a_part_of_a_whole_is_never_zero_unless_it_is() -> None:
@@ -38,9 +35,8 @@ def test_a_part_of_a_whole_is_never_zero_unless_it_is() -> None:
     assert {part: format_part(part) for part in parts} == parts
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
+def test_a_number_of_two_digits_has_two_after_rounding() -> None:
+    for value, text in [
         (0.0, "0.0"),
         (0.5, "0.50"),
         (2.0, "2.0"),
@@ -53,12 +49,11 @@ def test_a_part_of_a_whole_is_never_zero_unless_it_is() -> None:
         (4.8e-10, "4.8e-10"),
         (math.nan, "nan"),
         (-math.inf, "-inf"),
-    ],
-)
-def test_a_number_of_two_digits_has_two_after_rounding(value: float, text: str) -> None:
-    assert format_two(value) == text
+    ]:
+        assert format_two(value) == text
 
 
+@pytest.mark.lint
 def test_no_module_writes_percent_by_itself() -> None:
     """`{share:.0%}` has no space before the sign."""
     found = [

@@ -162,9 +162,8 @@ def judge(tmp_path: Path, sides: Sides, text: str) -> Check:
     return compare_sides(sides, read_limits(path))
 
 
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
+def test_limits_decide_the_exit_code(late: Sides, tmp_path: Path) -> None:
+    for text, code in [
         ('[parameter]\n"drive_lag.tau" = {max = 0.6}', KEPT),
         ('[parameter]\n"drive_lag.tau" = {max = 0.4}', BROKEN),
         ('[parameter]\n"drive_lag.tau" = {min = 0.2, max = 0.6, change = 0.1}', BROKEN),
@@ -172,10 +171,8 @@ def judge(tmp_path: Path, sides: Sides, text: str) -> Check:
         ("[error]\nposition = {max = 10.0}", KEPT),
         ("[error]\nposition = {max = 0.0001}", BROKEN),
         ("[slip]\nice = {max = 0.1}", UNDETERMINED),
-    ],
-)
-def test_limits_decide_the_exit_code(late: Sides, tmp_path: Path, text: str, code: int) -> None:
-    assert judge(tmp_path, late, text).code == code
+    ]:
+        assert judge(tmp_path, late, text).code == code
 
 
 def test_a_limit_within_the_interval_cannot_be_told(late: Sides, tmp_path: Path) -> None:

@@ -110,6 +110,7 @@ def recorded(shared_logs: Path, recorded_results: Path, tmp_path_factory: pytest
     return store
 
 
+@pytest.mark.long
 def test_published_medians_come_out(recorded: Store) -> None:
     answer = compare_results(recorded, Question(by=("run",), as_published=True))
     medians = {
@@ -122,6 +123,7 @@ def test_published_medians_come_out(recorded: Store) -> None:
     assert tile < snow < gravel
 
 
+@pytest.mark.long
 def test_real_runs_are_told_apart_only_where_they_differ(recorded: Store) -> None:
     answer = compare_results(recorded, Question(by=("run",)))
     pairs = {

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 from comparison_store import Run, write_run
+from few import few
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -133,7 +134,7 @@ def draw_bins(
     return pl.concat(parts)
 
 
-@pytest.mark.parametrize("between", [0.0, 0.2])
+@pytest.mark.parametrize("between", few([0.0, 0.2], 2))
 def test_a_ground_with_one_run_of_two_cells_alarms_once_in_twenty(between: float) -> None:
     """Its level is known much less than those of others: a spread pooled over runs alarmed in a third."""
     rng, draws = np.random.default_rng(6), 150
@@ -215,6 +216,7 @@ def test_the_levels_stand_in_the_table_of_datasets(answer: Answer) -> None:
         assert ice["equal_low"] < ice["equal_modulus"] < ice["equal_high"]
 
 
+@pytest.mark.long
 def test_runs_of_one_ground_agree_better_at_equal_driving_on_recordings(
     shared_logs: Path, recorded_results: Path, tmp_path: Path
 ) -> None:

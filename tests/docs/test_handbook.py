@@ -19,6 +19,8 @@ from pipeline.models import find_effect, list_effects
 from pipeline.sources import Configuration, list_presets
 from schemas import list_contracts
 
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 SYMPTOMS = sorted((ROOT / "docs" / "pages" / "symptoms").glob("[!i]*.md"))

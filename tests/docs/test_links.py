@@ -8,6 +8,8 @@ import pytest
 from markdown.extensions.toc import slugify
 from reference import SOURCES, find_page, write_reference
 
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "pages"
 TEXTS = [

@@ -7,6 +7,8 @@ from pathlib import Path
 import measured_tables as tables
 import pytest
 
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).parents[2]
 FILES = sorted(tables.MEASURED.glob("*.json"))
 

@@ -10,6 +10,8 @@ import pytest
 from moving_picture import join_frames
 from pictures import STEPS
 
+pytestmark = pytest.mark.lint
+
 FALLING = Path(__file__).parents[2] / "docs" / "pages" / "pictures" / "falling.png"
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MOST_BYTES = 300_000

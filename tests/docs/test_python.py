@@ -19,6 +19,7 @@ SAID = {
 }
 
 
+@pytest.mark.lint
 def test_python_of_a_page_is_one_session(tmp_path: Path) -> None:
     text = (
         "```pycon\n>>> for k in (1, 2):\n...     print(k)\n...\n1\n2\n```\nand\n```pycon\n>>> k + 1\n3\n```\n"
@@ -31,6 +32,7 @@ def test_python_of_a_page_is_one_session(tmp_path: Path) -> None:
             run(replace(commands[0], text="missing"))
 
 
+@pytest.mark.lint
 def test_each_notebook_is_stored_without_outputs() -> None:
     assert {path.stem for path in NOTEBOOKS} == set(SAID)
     for path in NOTEBOOKS:
@@ -38,6 +40,7 @@ def test_each_notebook_is_stored_without_outputs() -> None:
         assert [cell for cell in cells if cell.outputs or cell.execution_count] == []
 
 
+@pytest.mark.long
 def test_the_first_notebook_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its cells one after the other, without a notebook server: the last expression of each is shown."""
     (tmp_path / "data_samples").symlink_to(ROOT / "data_samples")

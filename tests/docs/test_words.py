@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).parents[2]
 RENDERED = ("pipeline/cli", "pipeline/models/effects")
 """Folders whose docstrings are shown, too: as help texts, and as pages of the catalogue."""

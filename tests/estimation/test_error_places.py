@@ -57,9 +57,8 @@ def test_what_a_region_holds_is_compared_with_the_same_commands_elsewhere() -> N
     assert _expect_square(response, error, rows) == pytest.approx(inside, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("kind", "share", "expected", "counts"),
-    [
+def test_a_region_counts_beyond_what_is_no_matter_of_it() -> None:
+    for kind, share, expected, counts in [
         ("command", 0.40, 0.30, True),
         ("command", 0.38, 0.30, False),
         ("place", 0.75, 0.70, False),
@@ -67,11 +66,7 @@ def test_what_a_region_holds_is_compared_with_the_same_commands_elsewhere() -> N
         ("time", 0.30, 0.19, True),
         # In a fifth of the time there is a fifth of the error, whatever the commands let expect.
         ("time", 0.21, 0.10, False),
-    ],
-)
-def test_a_region_counts_beyond_what_is_no_matter_of_it(
-    kind: str, share: float, expected: float, *, counts: bool
-) -> None:
-    time_share = {"place": 0.5, "time": 0.2}.get(kind, expected)
-    region = Region("x", kind, "turning", (1.0,), share, time_share, 0.1, expected)
-    assert (pick_regions([region], np.ones((4, 3)), _NOISE) == [region]) == counts
+    ]:
+        time_share = {"place": 0.5, "time": 0.2}.get(kind, expected)
+        region = Region("x", kind, "turning", (1.0,), share, time_share, 0.1, expected)
+        assert (pick_regions([region], np.ones((4, 3)), _NOISE) == [region]) == counts

@@ -26,9 +26,8 @@ def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None
     assert not is_exceeded(limit, replace(_CONDITIONS, exceeded={"another": 9.0}))
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
+def test_what_is_too_small_or_another_in_disguise_is_not_named() -> None:
+    for name, values in [
         ("transport_delay", {"d": 0.008}),
         ("lateral_skid", {"c": -0.05}),
         ("heading_skew", {"d": -0.1}),
@@ -40,10 +39,8 @@ def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None
         ("effective_track", {"k": 6.0}),
         ("body_inertia", {"tau": 5.0}),
         ("clock_offset", {"d": 0.1}),
-    ],
-)
-def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values: dict[str, float]) -> None:
-    assert not is_nameable(find_effect(name)(**values), _CONDITIONS)
+    ]:
+        assert not is_nameable(find_effect(name)(**values), _CONDITIONS)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from few import few
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -43,7 +44,7 @@ def _drive(program: str, effects: Mapping[str, object], folder: Path, vehicle: s
     return diagnose_runs([Recording(manifest.run, tables)], preset).runs[0]
 
 
-@pytest.mark.parametrize("program", ["straight", "spins"])
+@pytest.mark.parametrize("program", few(["straight", "spins"], 2))
 def test_an_old_heading_is_no_old_position_unless_the_vehicle_drives_and_turns(
     program: str, tmp_path: Path
 ) -> None:

@@ -39,9 +39,8 @@ def test_no_term_of_a_formula_depends_on_place_or_time(*, more: bool) -> None:
         assert not {name.removesuffix("_rate") for name in names} & {"x", "y", "t"}, term.id
 
 
-@pytest.mark.parametrize(
-    ("after", "raises", "lowers"),
-    [
+def test_an_effect_raises_or_lowers_the_errors_by_one_rule() -> None:
+    for after, raises, lowers in [
         ((1.032, 1.17), True, False),
         ((1.002, 1.002), True, False),
         ((1.02, 1.0), True, False),
@@ -53,14 +52,10 @@ def test_no_term_of_a_formula_depends_on_place_or_time(*, more: bool) -> None:
         ((1.03, 0.91), False, True),
         ((1.03, 0.997), True, False),
         ((1.12, 0.98), False, False),
-    ],
-)
-def test_an_effect_raises_or_lowers_the_errors_by_one_rule(
-    after: Pair, *, raises: bool, lowers: bool
-) -> None:
-    before = errors_of((1.0, 1.0))
-    assert raises_errors(before, errors_of(after)) is raises
-    assert lowers_errors(before, errors_of(after)) is lowers
+    ]:
+        before = errors_of((1.0, 1.0))
+        assert raises_errors(before, errors_of(after)) is raises
+        assert lowers_errors(before, errors_of(after)) is lowers
 
 
 def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_not() -> None:
@@ -80,9 +75,8 @@ def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_no
     ]
 
 
-@pytest.mark.parametrize(
-    ("speeds", "is_one"),
-    [
+def test_commands_of_one_speed_are_told_by_their_spread() -> None:
+    for speeds, is_one in [
         ([0.0, 0.1, 0.1, 0.1, 0.0], True),
         ([0.0] * 30 + [0.05] + [0.1] * 40, True),
         ([1.0] * 20 + [0.9] * 20, True),
@@ -90,11 +84,9 @@ def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_no
         (list(np.linspace(0.0, 1.0, 50)), False),
         ([0.0, 0.0], False),
         ([], False),
-    ],
-)
-def test_commands_of_one_speed_are_told_by_their_spread(speeds: list[float], *, is_one: bool) -> None:
-    fastest = np.array(speeds, dtype=float)
-    assert _is_one_speed(fastest) is is_one
+    ]:
+        fastest = np.array(speeds, dtype=float)
+        assert _is_one_speed(fastest) is is_one
 
 
 def diagnose(log: Path, folder: Path) -> tuple[dict[str, Any], Model]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from few import few
 from motion_runs import simulate, vehicle_of
 from verbs import ask_verb, print_verb, run_verb
 
@@ -65,7 +66,7 @@ def test_no_speed_is_given_where_none_meets_the_tolerance_or_all_do() -> None:
     assert "unknown on sand: 15 predictions while driving, and 20 are needed" in lines[2]
 
 
-@pytest.mark.parametrize("ahead_s", [1.0, 2.0])
+@pytest.mark.parametrize("ahead_s", few([1.0, 2.0], 2))
 def test_a_wrong_wheel_radius_gives_the_speed_of_its_share(ahead_s: float) -> None:
     """Nine tenths of the way are driven: the error is a tenth of it, so 10 cm are reached after 1 m."""
     run = simulate({"wheel_radius": 0.9}, duration_s=200.0, disturbance=Disturbance(0.0, 0.0))

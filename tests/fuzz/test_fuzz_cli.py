@@ -10,6 +10,7 @@ FINE = Answer(0, out='{"a": 1}')
 FILES = {"log.mcap": (3, 1), "out/x": (1, 1)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("answer", "word"),
     [
@@ -31,6 +32,7 @@ def test_it_notices_what_it_looks_for(answer: Answer, word: str, tmp_path: Path)
     assert bool(found) == bool(word)
 
 
+@pytest.mark.long
 def test_it_notices_files_outside_the_out_folder(tmp_path: Path) -> None:
     case = Case(tmp_path, ["inspect", "log.mcap", "--json"], "log.mcap")
     assert not judge(case, FINE, FILES, FILES | {"out/y": (1, 1)})
@@ -38,6 +40,7 @@ def test_it_notices_files_outside_the_out_folder(tmp_path: Path) -> None:
         assert "outside" in judge(case, FINE, FILES, after)
 
 
+@pytest.mark.long
 def test_damage_is_never_the_end_of_the_fuzz() -> None:
     rng = random.Random(1)  # noqa: S311 - no secret
     for _ in range(300):

@@ -10,6 +10,7 @@ from fuzz_exports import run
 from pipeline.export import list_targets
 
 
+@pytest.mark.long
 def test_odd_models_are_exported_as_data_or_refused_in_one_line(tmp_path: Path) -> None:
     counts = run(math.inf, 1, tmp_path, most=25)
     assert min(counts[name] for name in ("read", "refused", "python", "json", "gazebo", "csv")) > 0
@@ -20,6 +21,7 @@ def test_all_targets_have_a_reader() -> None:
     assert set(READERS) == {target.name for target in list_targets()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("target", "text"),
     [

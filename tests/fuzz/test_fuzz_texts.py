@@ -3,6 +3,7 @@
 import random
 from pathlib import Path
 
+import pytest
 from fuzz_texts import (
     CONFIGURATION,
     FORMULAS,
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 MODELS = write_models()
 
 
+@pytest.mark.long
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_text_is_read_or_refused_in_one_line(tmp_path: Path, seed: int) -> None:

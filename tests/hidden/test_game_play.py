@@ -42,6 +42,8 @@ from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.simulate import EffectSpec, State, list_effects, simulate_run
 
+pytestmark = pytest.mark.long
+
 
 def test_a_log_does_not_hold_its_answer(tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
@@ -183,7 +185,6 @@ def test_an_interrupted_scoring_loses_only_the_line_that_was_being_written(tmp_p
     assert set(read_records([path])) == {one.job, two.job, three.job}
 
 
-@pytest.mark.long
 def test_a_frozen_answer_is_compared_number_by_number(tmp_path: Path) -> None:
     case = Case("empty", "910100")
     freeze(case, tmp_path)
@@ -253,12 +254,11 @@ def test_a_late_localization_is_judged_beside_poses_as_they_were_stamped(tmp_pat
     assert late.t_m > record.checked.true.t_m
 
 
-@pytest.mark.parametrize("kind", ["noisy", pytest.param("plain", marks=pytest.mark.long)])
+@pytest.mark.parametrize("kind", ["noisy", "plain"])
 def test_in_an_empty_log_nothing_is_named_and_nothing_flagged(kind: str, tmp_path: Path) -> None:
     assert is_clean(play(Job("empty", 4, kind), tmp_path))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "kind"),
     [(98_001, "closed"), (98_009, "closed"), (98_002, "closed_rough"), (98_007, "closed_rough")],
@@ -287,7 +287,6 @@ def test_physics_that_no_catalogue_has_is_flagged_and_its_formula_helps(tmp_path
     assert has_useful_formula(record)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "kind", "channel"),
     [(150_000, "wind_up", "x"), (150_001, "wind_up", "x"), (150_001, "locked_axle", "w")],
@@ -299,7 +298,6 @@ def test_what_a_drive_remembers_is_flagged_though_no_effect_takes_it(
     assert channel in play(Job("odd", seed, kind), tmp_path).score.flagged
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "kind", ["brake_lag", "reversal_pause", "side_lag", "steering_play", "torque_limit", "wheel_servo"]
 )
@@ -332,7 +330,6 @@ def score_many(jobs: list[Job]) -> list[Record]:
     return records
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("category", "least"), [("single", 0.9), ("equipped", 0.8), ("sets", 0.8)])
 def test_most_hidden_effects_are_exactly_right(category: str, least: float) -> None:
     effect = "each" if category == "single" else None
@@ -344,26 +341,22 @@ def test_most_hidden_effects_are_exactly_right(category: str, least: float) -> N
         assert sum(map(is_as_good, counted)) >= least * len(counted), "\n".join(describe(category, records))
 
 
-@pytest.mark.long
 def test_empty_logs_stay_empty() -> None:
     records = score_many(list_jobs(["empty"], range(20, 80)))
     assert sum(map(is_clean, records)) >= 0.95 * len(records), "\n".join(describe("empty", records))
 
 
-@pytest.mark.long
 def test_poor_driving_gives_no_confident_wrong_name() -> None:
     records = score_many(list_jobs(["poor"], range(20, 60)))
     wrong = sum(map(has_wrong_name, records))
     assert wrong <= 0.1 * len(records), "\n".join(describe("poor", records))
 
 
-@pytest.mark.long
 def test_rigid_bodies_show_what_was_built_into_them() -> None:
     records = score_many(list_jobs(["rigid"], range(20, 23), "each"))
     assert sum(map(is_found, records)) >= 0.8 * len(records), "\n".join(describe("rigid", records))
 
 
-@pytest.mark.long
 def test_a_heading_skew_that_no_prediction_shows_is_a_finding_and_no_name(tmp_path: Path) -> None:
     """A heading skew of 18 ms with an interval from -3 to 38 ms was named beside the three hidden effects."""
     log = tmp_path / "run.mcap"
@@ -376,7 +369,6 @@ def test_a_heading_skew_that_no_prediction_shows_is_a_finding_and_no_name(tmp_pa
     assert str(said).startswith("heading_skew reduces the error over half a second, but not ")
 
 
-@pytest.mark.long
 def test_a_frozen_log_in_closed_loop_is_examined(tmp_path: Path) -> None:
     case = Case("hills", "910101c")
     freeze(case, tmp_path)

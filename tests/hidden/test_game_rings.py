@@ -29,6 +29,8 @@ from test_injections import DRIVE, tables  # noqa: F401 - a fixture
 
 from pipeline.core import SlipError
 
+pytestmark = pytest.mark.long
+
 HERE = Path(maker.__file__).parent
 STANDARD = ("geometry_msgs", "ackermann_msgs", "nav_msgs", "sensor_msgs", "std_msgs", "builtin_interfaces")
 TASKS = 5
@@ -51,7 +53,6 @@ def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_and_one_that_nobody_knows_others(
     ring: Path, tmp_path: Path
 ) -> None:

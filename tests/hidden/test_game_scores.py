@@ -15,6 +15,8 @@ from game import score as scorer
 from game.rings import list_names
 from game.score import AnswerError, TaskScore, read_answer, read_truth, score_ring, score_task
 
+pytestmark = pytest.mark.long
+
 HERE = Path(scorer.__file__).parent
 NAMES = list_names()
 WINDOWS = 3

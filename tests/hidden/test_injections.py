@@ -9,6 +9,8 @@ import pytest
 from inject import Answer, judge
 from injections import Drive, Injection, Tables, list_injections
 
+pytestmark = pytest.mark.long
+
 DRIVE = Drive(0.1, 0.5)
 BY_NAME = {injection.name: injection for injection in list_injections()}
 

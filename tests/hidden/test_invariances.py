@@ -9,6 +9,8 @@ from inject import STANDING, Answer, ask, judge
 from injections import Injection, list_injections
 from measuring import RECORDINGS
 
+pytestmark = pytest.mark.long
+
 _SAMPLES = Path(__file__).parents[2] / "data_samples"
 _BY_NAME = {injection.name: injection for injection in list_injections()}
 _NOTHING = Injection("nothing", lambda tables, _: tables)
@@ -34,7 +36,6 @@ def _assert_same(before: Answer, after: Answer) -> None:
         assert after.numbers[label][0] == pytest.approx(value, rel=1e-4, abs=room)
 
 
-@pytest.mark.long
 def test_neither_the_map_nor_the_recorder_s_start_changes_an_answer() -> None:
     turned, earlier = (_BY_NAME[name].change for name in _EXACT)
     both = Injection("both", lambda tables, drive: earlier(turned(tables, drive), drive))
@@ -42,7 +43,6 @@ def test_neither_the_map_nor_the_recorder_s_start_changes_an_answer() -> None:
     _assert_same(ask(log, _NOTHING, both=False), ask(log, both, both=False))
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not _DRIVEN, reason="the recordings are not there")
 @pytest.mark.parametrize("change", _EXACT)
 @pytest.mark.parametrize("name", _DRIVEN)
@@ -51,7 +51,6 @@ def test_recordings_keep_their_answer_wherever_the_map_lies(name: str, change: s
     _assert_same(_ask_as_recorded(log), ask(log, _BY_NAME[change], both=True))
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not _DRIVEN, reason="the recordings are not there")
 def test_fewer_or_noisier_poses_give_hardly_any_other_name() -> None:
     """Names may be lost or become undecided; of those that are given, three in a hundred may be others."""
@@ -66,7 +65,6 @@ def test_fewer_or_noisier_poses_give_hardly_any_other_name() -> None:
     assert len(others) <= 0.03 * named, others
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not _DRIVEN, reason="the recordings are not there")
 def test_a_break_in_a_recording_is_told_where_it_is() -> None:
     """Where it stands for the track on the ladder's lower rungs, the last one has it in its place again."""

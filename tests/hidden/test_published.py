@@ -9,6 +9,8 @@ from verbs import run_verb
 
 import slip
 
+pytestmark = pytest.mark.long
+
 
 def make_content(
     *effects: tuple[str, str, float], undecided: tuple[list[str], ...] = ()
@@ -50,7 +52,6 @@ def test_without_the_recordings_it_says_so(tmp_path: Path, capsys: pytest.Captur
     assert "not here" in capsys.readouterr().out
 
 
-@pytest.mark.long
 def test_models_are_off_by_what_was_published(tmp_path: Path) -> None:
     folder = published.PUBLISHED / "optiodom_differential"
     if not folder.is_dir():
@@ -81,7 +82,6 @@ def test_circles_one_way_round_do_not_tell_a_track_from_unequal_wheels(tmp_path:
     assert published.judge_undecided("", {"effective_track", "wheel_asymmetry"}, content).verdict == "right"
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not published.PUBLISHED.is_dir(), reason="../shared/published is not here")
 def test_an_effect_that_undoes_another_is_not_named_and_no_formula_hides_the_offset(tmp_path: Path) -> None:
     logs = sorted((published.PUBLISHED / "optiodom_tricycle").glob("tri_*.mcap"))

@@ -12,6 +12,8 @@ from pipeline.simulate.facts import VEHICLES, SimulateError
 from pipeline.simulate.messages import SimulatedRun
 from pipeline.simulate.scenario import Ground, Program, Scenario
 
+pytestmark = pytest.mark.long
+
 Floats = NDArray[np.float64]
 SPIN = Scenario(program=Program("circle", speed_scale=0.0), duration_s=15.0)
 STRAIGHT = Scenario(program=Program("circle", turn_scale=0.0), duration_s=12.0)

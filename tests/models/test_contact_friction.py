@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from few import few
 from motion_runs import QUIET, simulate, vehicle_of
 from scipy.integrate import solve_ivp
 
@@ -73,7 +74,7 @@ def test_one_step_of_the_wheels_is_answered_as_the_equations_say() -> None:
     assert got[:, -1] == pytest.approx(means[:, -1], abs=2e-3)
 
 
-@pytest.mark.parametrize("friction", [0.1, 0.3, 0.9])
+@pytest.mark.parametrize("friction", few([0.1, 0.3, 0.9], 3))
 def test_a_drive_moves_as_with_far_shorter_steps(friction: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps with the friction of their start made fits of a true friction of 0.3 end near 0.315."""
     values = {"friction": friction, "creep": 0.3, "k": 1.8, "gyration": 1.1}
@@ -84,7 +85,7 @@ def test_a_drive_moves_as_with_far_shorter_steps(friction: float, monkeypatch: p
     assert np.sqrt(np.mean((usual - short) ** 2, axis=1)).max() < 4e-3
 
 
-@pytest.mark.parametrize("speed", [0.5, 2.0])
+@pytest.mark.parametrize("speed", few([0.5, 2.0], 2))
 def test_while_wheels_hardly_slide_the_lag_grows_with_speed_and_the_track_is_wider(speed: float) -> None:
     values = {"friction": math.inf, "creep": 3.0, "k": 1.8, "gyration": math.sqrt(1.8)}
     context, moved = _step(values, (0.95 * speed, 1.05 * speed), cells=200)
@@ -101,7 +102,7 @@ def test_finer_cells_give_the_same_motion() -> None:
     assert np.sqrt(np.mean((one - seen) ** 2, axis=1)) == pytest.approx(0.0, abs=0.006)
 
 
-@pytest.mark.parametrize("count", [3, 9, 18])
+@pytest.mark.parametrize("count", few([3, 9, 18], 3))
 def test_bodies_that_are_computed_at_once_move_as_each_does_alone(count: int) -> None:
     context, kind = _compare().context, cast("type[JointBody]", find_effect("contact_friction"))
     draws = np.random.default_rng(count)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from exported_files import CAR, FIT, HUSKY, make
 from exported_texts import HOSTILE, READERS
+from few import few
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
@@ -85,7 +86,7 @@ def test_a_number_of_several_grounds_names_each() -> None:
     assert "# effective_track.k = 2.2, the mean of 1.9 on 'tile', 2.5 on 'snow'" in text
 
 
-@pytest.mark.parametrize(("target", "kind"), TARGETS)
+@pytest.mark.parametrize(("target", "kind"), few(TARGETS, 4))
 @settings(max_examples=8)
 @given(name=NAMES)
 def test_a_name_is_data_in_the_files_of_all_targets(target: str, kind: str, name: str) -> None:
@@ -146,7 +147,7 @@ def list_absurd(kind: str) -> list[ModelFile]:
     return files
 
 
-@pytest.mark.parametrize(("target", "kind"), TARGETS)
+@pytest.mark.parametrize(("target", "kind"), few(TARGETS, 4))
 def test_absurd_numbers_are_refused_in_one_line(target: str, kind: str) -> None:
     for file in list_absurd(kind):
         with pytest.raises(SlipError) as caught:

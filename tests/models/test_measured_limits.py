@@ -3,6 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
+from few import few
 from motion_runs import align, extract, make_scenario, simulate, vehicle_of
 
 from pipeline.estimation import EstimationData, Input
@@ -27,7 +28,8 @@ def test_a_limit_is_searched_above_what_wheels_exceed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "values"), [("acceleration_limit", {"limit": 6.0}), ("torque_limit", {"tau": 0.4, "limit": 6.0})]
+    ("name", "values"),
+    few([("acceleration_limit", {"limit": 6.0}), ("torque_limit", {"tau": 0.4, "limit": 6.0})], 2),
 )
 def test_four_wheels_that_turn_against_each_other_go_on_where_a_prediction_begins(
     name: str, values: dict[str, float]

@@ -2,18 +2,22 @@
 
 import ast
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.cli.verbs_drives import list_written_effects
 from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect, format_effect
 from pipeline.models.effect import Late
-from pipeline.models.parameter import Conditions, Largest, is_of_one_run
+from pipeline.models.parameter import Conditions, Largest, is_of_one_run, parse_unit
+from pipeline.simulate import list_effects as list_simulated
 
 EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
+SIMULATED = {spec.id: spec for spec in (*list_simulated(), *list_written_effects())}
 SOURCES = Path(__file__).parents[2] / "pipeline"
 OWN = SOURCES / "models" / "effects"
 GENERIC = sorted(
@@ -47,6 +51,7 @@ def list_mentions(path: Path) -> list[str]:
     return found
 
 
+@pytest.mark.lint
 def test_no_generic_file_knows_an_effect() -> None:
     knowing = {
         name: [line for line in list_mentions(path) if line.split(": ")[1] not in NAMESAKES.get(name, ())]
@@ -57,7 +62,38 @@ def test_no_generic_file_knows_an_effect() -> None:
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
-def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
+def test_what_an_effect_says_of_itself_holds(effect: type[Effect]) -> None:
+    check_page(effect)
+    check_sizes(effect)
+    check_relations(effect)
+    spec = SIMULATED[effect.id]
+    assert {p.name: p.unit for p in effect.parameters} == {p.name: p.unit for p in spec.parameters}
+    assert effect.kinds == spec.kinds
+    usual = effect().make_usual(ASKED)
+    assert not usual.is_neutral
+    assert not usual.is_degenerate(Conditions(ASKED, encoders=True, gyro=True))
+
+
+def check_page(effect: type[Effect]) -> None:
+    """It names formula, parameters, units and source."""
+    page = effect.find_page()
+    assert "Source: " in page
+    assert re.search(r"^ {4}\S", page, flags=re.MULTILINE), "the page has no indented formula"
+    for parameter in effect.parameters:
+        parse_unit(parameter.unit, effect.id)
+        assert re.search(rf"\b{re.escape(parameter.name)}\b", page), parameter.name
+        if parameter.unit != "1":
+            assert f"[{parameter.unit}]" in page, parameter.unit
+        low, high = parameter.bounds
+        assert low < high
+        assert low <= parameter.typical <= high
+        assert (
+            math.isnan(parameter.neutral) or math.isinf(parameter.neutral) or low <= parameter.neutral <= high
+        )
+
+
+def check_sizes(effect: type[Effect]) -> None:
+    """They have reasons and fit each other."""
     page = format_effect(effect)
     for reading in effect.readings:
         assert reading.text in page
@@ -80,8 +116,10 @@ def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
             assert math.isnan(effect().parameter(parameter.instead_of).neutral)
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
-def test_relations_hold_on_both_sides(effect: type[Effect]) -> None:
+def check_relations(effect: type[Effect]) -> None:
+    """They hold on both sides."""
+    assert set(effect.confused_with) | set(effect.equivalent_to) <= BY_ID.keys() - {effect.id}
+    assert bool(effect.equivalent_to) == bool(effect.equivalent_when)
     assert set(effect.contains) <= BY_ID.keys() - {effect.id}
     assert all(effect.id in BY_ID[name].same_in_one_motion for name in effect.same_in_one_motion)
     assert all(effect.id in BY_ID[name].equivalent_to for name in effect.equivalent_to)
@@ -93,19 +131,12 @@ def test_relations_hold_on_both_sides(effect: type[Effect]) -> None:
     assert all(other.id in BY_ID for other in effect().list_softer(ASKED))
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
-def test_a_usual_size_is_that_effect_and_no_other(effect: type[Effect]) -> None:
-    usual = effect().make_usual(ASKED)
-    assert not usual.is_neutral
-    assert not usual.is_degenerate(Conditions(ASKED, encoders=True, gyro=True))
-
-
-@pytest.mark.parametrize("late", Late, ids=[late.name for late in Late])
-def test_every_delay_that_sensors_know_is_one_effect(late: Late) -> None:
-    (effect,) = [effect for effect in EFFECTS if effect.late is late]
-    assert find_late_effect(late) is effect
-    assert effect.of_delay(0.1).delay == 0.1
-    assert effect.of_delay(1e3).delay == effect.parameters[0].bounds[1]
+def test_every_delay_that_sensors_know_is_one_effect() -> None:
+    for late in Late:
+        (effect,) = [effect for effect in EFFECTS if effect.late is late]
+        assert find_late_effect(late) is effect
+        assert effect.of_delay(0.1).delay == 0.1
+        assert effect.of_delay(1e3).delay == effect.parameters[0].bounds[1]
 
 
 def test_parts_that_are_found_together_make_the_whole() -> None:

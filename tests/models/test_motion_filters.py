@@ -99,32 +99,32 @@ def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[flo
     assert held.max() <= values.max() + 1e-9
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_rate_limit_follows_its_input_step_by_step(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    size, step = 600, 0.01
-    signal = np.repeat(rng.normal(size=size) * rng.integers(0, 2, size), rng.integers(2, 25, size))[:size]
-    first = np.unique(np.concatenate(([0], rng.integers(1, size, 3))))
-    start = np.where(rng.random(first.size) < 0.5, np.nan, rng.normal(size=first.size))
-    limit = float(10.0 ** rng.uniform(-0.5, 2.0))
-    found = limit_rate(
-        signal, limit, step, Resets(np.zeros(size, dtype=np.int64), first, first, start[:, None]), start
-    )
-
-    begins = dict(zip(first.tolist(), start.tolist(), strict=True))
-    value = signal[0]
-    for cell in range(size):
-        if cell in begins:
-            value = begins[cell] if np.isfinite(begins[cell]) else signal[cell]
-        gap, most = signal[cell] - value, limit * step
-        # The mean of a cell in which the signal moves evenly and then waits.
-        mean = (
-            signal[cell] - gap * abs(gap) / (2.0 * most)
-            if abs(gap) < most
-            else value + 0.5 * np.sign(gap) * most
+def test_a_rate_limit_follows_its_input_step_by_step() -> None:
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        size, step = 600, 0.01
+        signal = np.repeat(rng.normal(size=size) * rng.integers(0, 2, size), rng.integers(2, 25, size))[:size]
+        first = np.unique(np.concatenate(([0], rng.integers(1, size, 3))))
+        start = np.where(rng.random(first.size) < 0.5, np.nan, rng.normal(size=first.size))
+        limit = float(10.0 ** rng.uniform(-0.5, 2.0))
+        found = limit_rate(
+            signal, limit, step, Resets(np.zeros(size, dtype=np.int64), first, first, start[:, None]), start
         )
-        value += np.clip(gap, -most, most)
-        assert found[cell] == pytest.approx(mean, abs=1e-9)
+
+        begins = dict(zip(first.tolist(), start.tolist(), strict=True))
+        value = signal[0]
+        for cell in range(size):
+            if cell in begins:
+                value = begins[cell] if np.isfinite(begins[cell]) else signal[cell]
+            gap, most = signal[cell] - value, limit * step
+            # The mean of a cell in which the signal moves evenly and then waits.
+            mean = (
+                signal[cell] - gap * abs(gap) / (2.0 * most)
+                if abs(gap) < most
+                else value + 0.5 * np.sign(gap) * most
+            )
+            value += np.clip(gap, -most, most)
+            assert found[cell] == pytest.approx(mean, abs=1e-9)
 
 
 @given(

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from few import few
 from motion_runs import WANDERING, simulate, vehicle_of
 
 from pipeline.estimation import (
@@ -179,7 +180,7 @@ def test_every_rung_is_what_its_effects_are_as_a_model() -> None:
         assert alone.fitted.model == rung.fitted.model
 
 
-@pytest.mark.parametrize("source", list(Input))
+@pytest.mark.parametrize("source", few(list(Input), 2))
 def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(source: Input) -> None:
     truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
     run = simulate(truth, duration_s=200.0, pose=WANDERING, disturbance=Disturbance())
@@ -197,7 +198,7 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
     assert np.allclose((x, y, position), 1.0, atol=0.15)
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", few([1, 3], 2))
 def test_understeer_in_turns_of_changing_speed_is_no_noise(seed: int) -> None:
     """What v^2 w adds to the yaw rate changes within a turn: without it the floor was up to thrice that."""
     car, understeer = vehicle_of("ackermann_car"), find_effect("understeer")(K=0.04)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from few import few
 from motion_runs import as_run, extract, make_scenario, pass_stages, tables_of, vehicle_of
 
 from pipeline.analysis import Options
@@ -202,7 +203,7 @@ def fit(scenario: Scenario) -> dict[str, tuple[float, float, float]]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", INCIDENTS)
+@pytest.mark.parametrize("kind", few(INCIDENTS, 3))
 def test_an_incident_does_not_move_what_is_fitted(kind: IncidentKind) -> None:
     calm = make_scenario(TRUTH, seed=3, duration_s=200.0)
     without = fit(calm)

@@ -37,21 +37,21 @@ def test_targets_are_found_by_being_there() -> None:
     assert all(target.about and target.source for target in list_targets())
 
 
-@pytest.mark.parametrize(("name", "vehicle"), CASES)
-def test_names_types_and_bounds_are_those_that_the_project_declares(name: str, vehicle: object) -> None:
-    found = read(name, export_model(make_full(vehicle), name))
-    assert found
-    for path, value in found.items():
-        schema = SCHEMAS[name][path]
-        if isinstance(schema, int):
-            assert isinstance(value, list)
-            assert len(value) == schema
-            assert {type(item) for item in value} == {bool if path.endswith("config") else float}, path
-        elif isinstance(schema, frozenset):
-            assert value in schema, path
-        else:
-            assert type(value) is float, path
-            assert schema[0] <= value <= schema[1], path
+def test_names_types_and_bounds_are_those_that_the_project_declares() -> None:
+    for name, vehicle in CASES:
+        found = read(name, export_model(make_full(vehicle), name))
+        assert found
+        for path, value in found.items():
+            schema = SCHEMAS[name][path]
+            if isinstance(schema, int):
+                assert isinstance(value, list)
+                assert len(value) == schema
+                assert {type(item) for item in value} == {bool if path.endswith("config") else float}, path
+            elif isinstance(schema, frozenset):
+                assert value in schema, path
+            else:
+                assert type(value) is float, path
+                assert schema[0] <= value <= schema[1], path
 
 
 def test_every_parameter_of_the_schemas_is_written_for_some_vehicle() -> None:
@@ -66,25 +66,25 @@ def test_every_parameter_of_the_schemas_is_written_for_some_vehicle() -> None:
         assert written == set(SCHEMAS[name]), name
 
 
-@pytest.mark.parametrize(("name", "vehicle"), CASES)
-def test_every_effect_stands_at_a_line_or_among_those_without_one(name: str, vehicle: object) -> None:
-    file = make_full(vehicle)
-    head, _, rest = export_model(file, name).partition("Not covered by these parameters:")
-    lines = [line.strip("# <!->") for line in rest.splitlines()]
-    unmapped = set()
-    for line in lines[1:]:
-        label = re.match(r"(\w+)\.\w+ = ", line)
-        if label is None:
-            break
-        unmapped.add(label[1])
-    text = export_model(file, name)
-    below = text[text.index(rest) :].split("\n", len(unmapped) + 1)[-1]
-    for effect in file.model:
-        stands = any(f"{effect.id}.{p.name} = " in below for p in effect.parameters)
-        assert stands or effect.id in unmapped, (effect.id, head)
-    known = {e.id for e in file.model if any(p.quantities for p in e.parameters)}
-    assert unmapped >= {e.id for e in file.model} - known
-    assert unmapped != {e.id for e in file.model} or name in {"robot_localization", "nav2_amcl"}
+def test_every_effect_stands_at_a_line_or_among_those_without_one() -> None:
+    for name, vehicle in CASES:
+        file = make_full(vehicle)
+        head, _, rest = export_model(file, name).partition("Not covered by these parameters:")
+        lines = [line.strip("# <!->") for line in rest.splitlines()]
+        unmapped = set()
+        for line in lines[1:]:
+            label = re.match(r"(\w+)\.\w+ = ", line)
+            if label is None:
+                break
+            unmapped.add(label[1])
+        text = export_model(file, name)
+        below = text[text.index(rest) :].split("\n", len(unmapped) + 1)[-1]
+        for effect in file.model:
+            stands = any(f"{effect.id}.{p.name} = " in below for p in effect.parameters)
+            assert stands or effect.id in unmapped, (effect.id, head)
+        known = {e.id for e in file.model if any(p.quantities for p in e.parameters)}
+        assert unmapped >= {e.id for e in file.model} - known
+        assert unmapped != {e.id for e in file.model} or name in {"robot_localization", "nav2_amcl"}
 
 
 @pytest.mark.parametrize("known", [HUSKY, F1TENTH], ids=["robot", "car"])

@@ -10,6 +10,8 @@ from motion_runs import vehicle_of
 
 from pipeline.sources import Vehicle
 
+pytestmark = pytest.mark.long
+
 
 @dataclass(eq=False)
 class Drive:

@@ -6,6 +6,8 @@ from pathlib import Path
 import audit
 import pytest
 
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).parents[2]
 
 

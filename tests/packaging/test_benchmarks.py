@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 RUNNER = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -30,7 +32,6 @@ def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
     assert done.stderr.startswith("there is no benchmark speed; there are analyze, ")
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", list_names())
 def test_a_benchmark_loads_and_says_how_it_is_asked(name: str) -> None:
     done = run(name, "--help")

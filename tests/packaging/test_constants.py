@@ -7,6 +7,8 @@ from pipeline.estimation import decision
 from pipeline.run import signals
 from pipeline.stages import align, inputs, timing, trust
 
+pytestmark = pytest.mark.long
+
 
 def test_what_a_number_changes_is_told_in_words() -> None:
     before: dict[str, float | str] = {"a modulus": 1.0, "a pose_jump pose": "found", "a fails": "ValueError"}

@@ -20,6 +20,7 @@ LINES = [
 ]
 
 
+@pytest.mark.lint
 def test_what_the_container_copies_is_there_and_it_starts_slip() -> None:
     copied = [
         word for name, rest in LINES if name == "COPY" and "--from" not in rest for word in rest.split()[:-1]
@@ -32,12 +33,14 @@ def test_what_the_container_copies_is_there_and_it_starts_slip() -> None:
     assert json.loads(dict(LINES)["ENTRYPOINT"]) == ["slip"]  # type: ignore[arg-type]
 
 
+@pytest.mark.lint
 def test_the_base_may_be_given_by_its_digest() -> None:
     words = dict(reversed(LINES))
     assert words["ARG"] == "BASE=python:3.11-slim"
     assert [rest.split()[0] for name, rest in LINES if name == "FROM"] == ["${BASE}", "${BASE}"]
 
 
+@pytest.mark.lint
 def test_the_container_has_what_its_page_advises() -> None:
     locked = (ROOT / "packaging" / "requirements-container.txt").read_text(encoding="utf-8")
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
@@ -49,6 +52,7 @@ def test_the_container_has_what_its_page_advises() -> None:
             assert name == "slip-pipeline" or f"\n{name}==" in f"\n{locked}", name
 
 
+@pytest.mark.lint
 @pytest.mark.parametrize(
     "name", ["requirements.txt", "requirements-dev.txt", "packaging/requirements-container.txt"]
 )

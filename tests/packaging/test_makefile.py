@@ -49,6 +49,7 @@ def test_make_alone_lists_the_verbs() -> None:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ready")
 def test_a_path_may_hold_spaces_and_quotes(tmp_path: Path) -> None:
     log = simulate_case("husky_tile", out=tmp_path / "first day" / "bob's $run.mcap", duration_s=20.0)
@@ -74,6 +75,7 @@ def test_losses_are_told_and_are_no_failure_of_make(tmp_path: Path) -> None:
     assert "with losses" in done.stdout + done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ready")
 def test_a_failure_fails(tmp_path: Path) -> None:
     done = make("analyze", f"LOG={tmp_path / 'missing.mcap'}", f"OUT={tmp_path / 'out'}")
@@ -82,6 +84,7 @@ def test_a_failure_fails(tmp_path: Path) -> None:
     assert make("analyze").returncode != 0
 
 
+@pytest.mark.lint
 @pytest.mark.parametrize("name", LOCKS)
 def test_locks_pin_by_hash_and_name_no_host(name: str) -> None:
     text = (ROOT / name).read_text()
@@ -91,6 +94,7 @@ def test_locks_pin_by_hash_and_name_no_host(name: str) -> None:
     assert "index-url" not in text
 
 
+@pytest.mark.lint
 def test_ci_needs_nothing_but_the_repository() -> None:
     script = (ROOT / ".ci" / "run").read_text()
 

@@ -45,6 +45,7 @@ def test_the_service_brings_the_results_up_to_date(home: Path) -> None:
     assert service["SuccessExitStatus"] == "3"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd here")
 def test_systemd_accepts_the_units(home: Path) -> None:
     around = os.environ | {"HOME": str(home), "XDG_RUNTIME_DIR": str(home)}
@@ -56,6 +57,7 @@ def test_systemd_accepts_the_units(home: Path) -> None:
         assert checked.returncode == 0, checked.stderr
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not shutil.which("flock"), reason="there is no flock here")
 def test_the_crontab_does_the_same_and_never_twice_at_once(home: Path) -> None:
     lines = [line for line in (RECIPES / "slip-batch.cron").read_text().splitlines() if line[0] != "#"]

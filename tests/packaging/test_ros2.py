@@ -26,6 +26,7 @@ OF_ROS = {"launch", "ros2cli", "ros2launch"}
 """Packages of every distribution of ROS 2, which are keys of rosdep by their names."""
 
 
+@pytest.mark.lint
 def test_the_manifest_keeps_the_rules_of_format_3() -> None:
     """REP 149: what must be there once, names, versions and the tags of dependencies."""
     package = ET.parse(PACKAGE / "package.xml").getroot()  # noqa: S314 - it is our own
@@ -42,6 +43,7 @@ def test_the_manifest_keeps_the_rules_of_format_3() -> None:
     assert [child.text for child in package.findall("export/build_type")] == ["ament_python"]
 
 
+@pytest.mark.lint
 def test_every_dependency_is_a_key_of_rosdep() -> None:
     package = ET.parse(PACKAGE / "package.xml").getroot()  # noqa: S314 - it is our own
     keys = {child.text for child in package if child.tag in DEPENDS}
@@ -62,6 +64,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return asked
 
 
+@pytest.mark.lint
 def test_what_is_installed_is_there(installed: dict[str, Any]) -> None:
     assert installed["version"] == VERSION
     files = [name for _, names in installed["data_files"] for name in names]
@@ -119,6 +122,7 @@ class _Action:
         return context[self.given[0]]
 
 
+@pytest.mark.long
 def test_the_launch_file_watches_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, kinds in {
         "launch": ("LaunchContext", "LaunchDescription"),

@@ -4,6 +4,10 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.lint
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "SECURITY.md"
 MOST_LINES = 90

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from few import few
 
 from pipeline.core import Floats
 from pipeline.recording.geometry import roll_wheels
@@ -68,7 +69,7 @@ def test_nothing_is_told_where_starts_are_much_slower_than_stops() -> None:
     assert drive_by_keys("limit", 0.6, 3.0) is None
 
 
-@pytest.mark.parametrize(("silences", "stops"), [(5, 5), (3, 12)])
+@pytest.mark.parametrize(("silences", "stops"), few([(5, 5), (3, 12)], 2))
 def test_the_interval_of_few_pauses_holds_the_time_out(silences: int, stops: int) -> None:
     """Response times vary by 0.04 s from one stop to the next."""
     rng, count, runs = np.random.default_rng(6), silences + stops, 300
@@ -91,8 +92,8 @@ def test_the_interval_of_few_pauses_holds_the_time_out(silences: int, stops: int
     assert np.mean(held) > 0.9
 
 
-@pytest.mark.parametrize("timeout_s", [0.3, 0.5, np.inf])
-@pytest.mark.parametrize("period_s", [1.0, 2.0])
+@pytest.mark.parametrize("timeout_s", few([0.3, 0.5, np.inf], 2))
+@pytest.mark.parametrize("period_s", few([1.0, 2.0], 2))
 def test_a_base_that_waits_less_than_its_commander_drives_in_bursts(
     period_s: float, timeout_s: float
 ) -> None:

@@ -23,12 +23,12 @@ def mix(*publishers: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     return times[order], asked[order]
 
 
-@pytest.mark.parametrize("other", [0.0, -0.7], ids=["zeros", "another speed"])
-@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.23], ids=str)
-def test_turns_are_found_where_they_are(period_s: float, other: float) -> None:
-    ((start, end),) = find_turns(*mix(send(0.1, 0.0, 60.0, 1.0), send(period_s, 20.037, 40.0, other)))
-    assert start == pytest.approx(20.0, abs=0.5)
-    assert end == pytest.approx(40.0, abs=0.5)
+def test_turns_are_found_where_they_are() -> None:
+    for period_s in [0.05, 0.1, 0.23]:
+        for other in [0.0, -0.7]:
+            ((start, end),) = find_turns(*mix(send(0.1, 0.0, 60.0, 1.0), send(period_s, 20.037, 40.0, other)))
+            assert start == pytest.approx(20.0, abs=0.5)
+            assert end == pytest.approx(40.0, abs=0.5)
 
 
 def test_one_publisher_is_not_accused() -> None:

@@ -172,9 +172,8 @@ def test_a_side_that_counts_backward_is_told_from_all_else(left: float, right: f
 C, W, G = "command", "wheels", "gyro"
 
 
-@pytest.mark.parametrize(
-    ("signs", "faults"),
-    [
+def test_the_fewest_faults_explain_the_signs() -> None:
+    for signs, faults in [
         ({(C, "ahead"): 1, (C, "turned"): 1, (W, "ahead"): 1, (W, "turned"): 1}, ()),
         ({(C, "ahead"): -1, (C, "turned"): 1, (W, "ahead"): -1, (W, "turned"): 1}, ("pose_backward",)),
         ({(C, "turned"): -1, (W, "turned"): -1, (G, "turned"): -1}, ("pose_mirrored",)),
@@ -183,14 +182,10 @@ C, W, G = "command", "wheels", "gyro"
         ({(C, "ahead"): -1, (C, "turned"): 1, (W, "ahead"): 1, (W, "turned"): 1}, ("command_ahead",)),
         ({(C, "turned"): 1, (W, "turned"): 1, (G, "turned"): -1}, ("gyro",)),
         ({(C, "turned"): -1, (G, "turned"): -1}, ("pose_mirrored",)),
-    ],
-)
-def test_the_fewest_faults_explain_the_signs(
-    signs: dict[tuple[str, str], int], faults: tuple[str, ...]
-) -> None:
-    made = find_reversed(signs)  # type: ignore[arg-type]
-    assert made.faults == faults
-    assert made.rivals == ()
+    ]:
+        made = find_reversed(signs)  # type: ignore[arg-type]
+        assert made.faults == faults
+        assert made.rivals == ()
 
 
 def test_of_two_that_contradict_each_other_both_may_be_wrong() -> None:
@@ -201,9 +196,8 @@ def test_of_two_that_contradict_each_other_both_may_be_wrong() -> None:
 DEGREE = np.pi / 180.0
 
 
-@pytest.mark.parametrize(
-    ("gains", "units"),
-    [
+def test_units_of_a_body_command() -> None:
+    for gains, units in [
         ((0.95, 0.6), ("m/s", "rad/s")),
         ((1.0, 0.77 * DEGREE), ("m/s", "deg/s")),
         ((1.0 / 3.6, 0.9), ("km/h", "rad/s")),
@@ -212,10 +206,8 @@ DEGREE = np.pi / 180.0
         ((0.3, 0.3), ("m/s", "rad/s")),
         ((0.4, 0.5), ("m/s", "rad/s")),
         ((0.01, None), ("cm/s", "rad/s")),
-    ],
-)
-def test_units_of_a_body_command(gains: tuple[float, float | None], units: tuple[str, str]) -> None:
-    assert find_body_units(gains, (0.95, 0.95)) == Units(units)
+    ]:
+        assert find_body_units(gains, (0.95, 0.95)) == Units(units)
 
 
 def test_of_two_readings_that_are_as_likely_both_are_told() -> None:
@@ -230,15 +222,17 @@ def test_a_poor_fit_shows_no_unit() -> None:
     assert find_body_units((0.9, 0.076), (0.5, 0.1)) == Units(("m/s", "rad/s"))
 
 
-@pytest.mark.parametrize(
-    ("commanded", "rolled", "radius", "unit"),
-    [(0.9, 0.1, None, "m"), (865.0, 79.0, None, "mm"), (99.0, None, None, "cm"), (None, 300.0, 0.3, "mm"),
-     (None, 0.9, None, "m"), (0.3, 0.03, None, "m"), (3.0, 1.0, None, "m")],
-)  # fmt: skip
-def test_unit_of_positions(
-    commanded: float | None, rolled: float | None, radius: float | None, unit: str
-) -> None:
-    assert find_pose_unit(commanded, rolled, radius) == unit
+def test_unit_of_positions() -> None:
+    for commanded, rolled, radius, unit in [
+        (0.9, 0.1, None, "m"),
+        (865.0, 79.0, None, "mm"),
+        (99.0, None, None, "cm"),
+        (None, 300.0, 0.3, "mm"),
+        (None, 0.9, None, "m"),
+        (0.3, 0.03, None, "m"),
+        (3.0, 1.0, None, "m"),
+    ]:
+        assert find_pose_unit(commanded, rolled, radius) == unit
 
 
 def test_a_poor_fit_of_a_strange_unit_is_known_by_its_size() -> None:
@@ -247,9 +241,8 @@ def test_a_poor_fit_of_a_strange_unit_is_known_by_its_size() -> None:
     assert find_body_units((0.2, 0.2), (0.4, 0.4)) == Units(("m/s", "rad/s"))
 
 
-@pytest.mark.parametrize(
-    ("nats", "lengths", "known", "unit", "rival"),
-    [
+def test_unit_of_a_steering_angle() -> None:
+    for nats, lengths, known, unit, rival in [
         # Large angles fit in their own unit only.
         ((900.0, 100.0), (1.0, None), None, "rad", None),
         ((100.0, 900.0), (None, 1.0), None, "deg", None),
@@ -258,39 +251,33 @@ def test_a_poor_fit_of_a_strange_unit_is_known_by_its_size() -> None:
         ((900.0, 900.0), (57.0, 1.0), None, "deg", None),
         ((900.0, 900.0), (10.0, 0.175), None, "rad", "deg"),
         ((900.0, 900.0), (10.0, 0.175), 9.0, "rad", None),
-    ],
-)
-def test_unit_of_a_steering_angle(
-    nats: tuple[float, float],
-    lengths: tuple[float | None, float | None],
-    known: float | None,
-    unit: str,
-    rival: str | None,
-) -> None:
-    names = ("rad", "deg")
-    made = find_steering_unit(
-        dict(zip(names, nats, strict=True)), dict(zip(names, lengths, strict=True)), known, "/drive"
-    )
-    assert made.likeliest[1] == unit
-    assert (made.rival[1] if made.rival else None) == rival
+    ]:
+        names = ("rad", "deg")
+        made = find_steering_unit(
+            dict(zip(names, nats, strict=True)), dict(zip(names, lengths, strict=True)), known, "/drive"
+        )
+        assert made.likeliest[1] == unit
+        assert (made.rival[1] if made.rival else None) == rival
 
 
-@pytest.mark.parametrize(
-    ("gain", "name", "unit"),
-    [(0.033, "/joint_states", "rad/s"), (0.3, "/joint_states", "rad/s"), (0.0105, "/wheel/left/rpm", "rpm"),
-     (0.0017, "/wheels", "deg/s"), (0.1, "/wheel/left/rpm", "rad/s"), (1.02, "/wheel/speed", "m/s"),
-     (0.5, "/wheel/speed", "rad/s"), (3e-4, "/joint_states", "")],
-)  # fmt: skip
-def test_unit_of_wheel_speeds(gain: float, name: str, unit: str) -> None:
-    assert find_wheel_unit(gain, 0.95, name) == unit
+def test_unit_of_wheel_speeds() -> None:
+    for gain, name, unit in [
+        (0.033, "/joint_states", "rad/s"),
+        (0.3, "/joint_states", "rad/s"),
+        (0.0105, "/wheel/left/rpm", "rpm"),
+        (0.0017, "/wheels", "deg/s"),
+        (0.1, "/wheel/left/rpm", "rad/s"),
+        (1.02, "/wheel/speed", "m/s"),
+        (0.5, "/wheel/speed", "rad/s"),
+        (3e-4, "/joint_states", ""),
+    ]:
+        assert find_wheel_unit(gain, 0.95, name) == unit
 
 
-@pytest.mark.parametrize(
-    ("gain", "share", "unit"), [(0.29, 0.9, "rad/s"), (0.0271, 0.9, "rpm"), (0.05, 0.35, "rad/s")]
-)
-def test_unit_of_the_wheels_of_a_known_vehicle(gain: float, share: float, unit: str) -> None:
+def test_unit_of_the_wheels_of_a_known_vehicle() -> None:
     """On ice a fit is poor, and its gain low: that is no unit."""
-    assert find_wheel_unit(gain, share, "/wheels", 0.3) == unit
+    for gain, share, unit in [(0.29, 0.9, "rad/s"), (0.0271, 0.9, "rpm"), (0.05, 0.35, "rad/s")]:
+        assert find_wheel_unit(gain, share, "/wheels", 0.3) == unit
 
 
 def test_a_measured_motion_is_no_command() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_motion import GAIN, STEP, Drive, draw, sides
+from few import few
 from written_logs import write_log
 
 from pipeline.analysis import Options
@@ -126,28 +127,31 @@ def with_positions_and_a_gyro_in_degrees(path: Path, drive: Drive) -> Path:
 
 @pytest.mark.parametrize(
     ("make", "said", "keys"),
-    [
-        (with_a_gyro_in_degrees, ["the gyro of /imu is in degrees"], {"imu.unit": "deg/s"}),
-        (with_positions_and_a_gyro_in_degrees, ["the gyro of /imu is in degrees"], {"imu.unit": "deg/s"}),
-        (stamped_in_the_future, ["its clock runs ahead"], {"command.time": "log"}),
-        (exchanged_and_one_counting_double, ["exchanged", "2 times"], {"wheels.exchanged": True}),
-        (turns_before_a_gear, ["turns before a gear"], {}),
-        (with_a_left_encoder_that_counts_double, ["left wheels' encoder counts 2 times"], {}),
-        (
-            with_one_wheel_backward,
-            ["rear_left_wheel of /joint_states counts backward"],
-            {"wheels.factors": {"rear_left_wheel": -1.0}},
-        ),
-        (with_one_wheel_counting_double, ["front_right_wheel of /joint_states counts 2 times"], {}),
-        (with_one_wheel_dead, ["rear_right_wheel"], {"wheels.right": ["front_right_wheel"]}),
-        (in_millimetres, ["are in mm"], {"pose.unit": "mm"}),
-        (in_centimetres, ["are in cm"], {"pose.unit": "cm"}),
-        (without_signs, ["have no sign"], {}),
-        (exchanged_in_rpm, ["exchanged", "rpm"], {"wheels.exchanged": True, "wheels.unit": "rpm"}),
-        (beside_an_idle_joystick, ["/nav/twist_out is taken for the command"], {}),
-        (backward_in_millimetres_per_second, ["backward"], {"wheels.sign": -1, "command.unit": "mm/s"}),
-        (turned_and_in_degrees, ["90 degrees"], {"pose.heading_deg": 90.0, "command.yaw_unit": "deg/s"}),
-    ],
+    few(
+        [
+            (with_a_gyro_in_degrees, ["the gyro of /imu is in degrees"], {"imu.unit": "deg/s"}),
+            (with_positions_and_a_gyro_in_degrees, ["the gyro of /imu is in degrees"], {"imu.unit": "deg/s"}),
+            (stamped_in_the_future, ["its clock runs ahead"], {"command.time": "log"}),
+            (exchanged_and_one_counting_double, ["exchanged", "2 times"], {"wheels.exchanged": True}),
+            (turns_before_a_gear, ["turns before a gear"], {}),
+            (with_a_left_encoder_that_counts_double, ["left wheels' encoder counts 2 times"], {}),
+            (
+                with_one_wheel_backward,
+                ["rear_left_wheel of /joint_states counts backward"],
+                {"wheels.factors": {"rear_left_wheel": -1.0}},
+            ),
+            (with_one_wheel_counting_double, ["front_right_wheel of /joint_states counts 2 times"], {}),
+            (with_one_wheel_dead, ["rear_right_wheel"], {"wheels.right": ["front_right_wheel"]}),
+            (in_millimetres, ["are in mm"], {"pose.unit": "mm"}),
+            (in_centimetres, ["are in cm"], {"pose.unit": "cm"}),
+            (without_signs, ["have no sign"], {}),
+            (exchanged_in_rpm, ["exchanged", "rpm"], {"wheels.exchanged": True, "wheels.unit": "rpm"}),
+            (beside_an_idle_joystick, ["/nav/twist_out is taken for the command"], {}),
+            (backward_in_millimetres_per_second, ["backward"], {"wheels.sign": -1, "command.unit": "mm/s"}),
+            (turned_and_in_degrees, ["90 degrees"], {"pose.heading_deg": 90.0, "command.yaw_unit": "deg/s"}),
+        ],
+        3,
+    ),
 )
 def test_a_situation_is_told_and_corrected(
     make: Callable[[Path, Drive], Path], said: list[str], keys: dict[str, object], tmp_path: Path
@@ -237,7 +241,7 @@ def test_wheels_of_a_known_vehicle_that_read_three_times_too_fast_are_told(tmp_p
     "names",
     [("steering_joint", "traction_joint"), ("front_steer", "front_wheel"), ("azimuth_1", "drive_motor")],
 )
-@pytest.mark.parametrize("commanded", [False, True])
+@pytest.mark.parametrize("commanded", few([False, True], 2))
 def test_a_wheel_that_steers_and_drives_is_a_tricycle(
     names: tuple[str, str], tmp_path: Path, *, commanded: bool
 ) -> None:

@@ -77,6 +77,7 @@ def test_no_page_has_a_serious_barrier(
         assert chrome.errors == []
 
 
+@pytest.mark.long
 def test_a_long_name_in_a_heading_does_not_widen_a_page(chrome: Chrome, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     style, name = read_own("report/page.css"), "warthog_wheels_gravel_2024_8_6_11h37s32" * 2

@@ -130,19 +130,17 @@ def test_only_our_scripts_may_run(outline: Outline) -> None:
     assert allowed == [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in runnable]
 
 
-@pytest.mark.parametrize(
-    "key", ["run", "vehicle", "terrain", "dataset", "topic", "reason", "finding", "where"]
-)
-def test_text_out_of_a_log_stays_text(key: str) -> None:
-    page = render_report(make_report(duration_s=20.0, names={key: HOSTILE}))
-    outline = outline_of(page)
-    assert len(outline.scripts) == 3
-    assert not any(tag == "img" for tag, _ in outline.tags)
-    assert outline.open == []
-    assert "alert(1)</script>" not in page
-    assert "\u202e" not in page
-    assert html.escape("<img src=x onerror=alert(2)>") in page or key == "dataset"
-    data_of(outline)
+def test_text_out_of_a_log_stays_text() -> None:
+    for key in ["run", "vehicle", "terrain", "dataset", "topic", "reason", "finding", "where"]:
+        page = render_report(make_report(duration_s=20.0, names={key: HOSTILE}))
+        outline = outline_of(page)
+        assert len(outline.scripts) == 3
+        assert not any(tag == "img" for tag, _ in outline.tags)
+        assert outline.open == []
+        assert "alert(1)</script>" not in page
+        assert "\u202e" not in page
+        assert html.escape("<img src=x onerror=alert(2)>") in page or key == "dataset"
+        data_of(outline)
 
 
 def render_without_figures(**names: str) -> str:
@@ -203,27 +201,25 @@ def test_a_long_log_stays_small() -> None:
     assert "Drawn from" in page
 
 
-@pytest.mark.parametrize(
-    "gone", ["velocities", "slip", "windows", "aggregates", "findings"], ids=lambda name: f"without_{name}"
-)
-@pytest.mark.parametrize("empty", [True, False], ids=["empty", "missing"])
-def test_a_missing_or_empty_table_costs_only_its_figures(
-    report: RunReport, gone: str, *, empty: bool
-) -> None:
-    tables = {name: frame for name, frame in report.tables.items() if name != gone}
-    if empty:
-        tables[gone] = report.tables[gone].clear()
-    outline = outline_of(render_report(RunReport(report.summary, tables, report.diagnosis, report.motion)))
-    drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
-    lost: dict[str, set[str]] = {
-        "velocities": {"trajectory", "paths", "stretch"},
-        "slip": {"modulus", "distribution", "command_space", "navigator", "step_response", "stretch"},
-        "windows": {"window_norms"},
-        "aggregates": {"split"},
-        "findings": set(),
-    }
-    assert set(list_places()) - drawn == lost[gone]
-    assert "h2 How much slip" in outline.headings
+def test_a_missing_or_empty_table_costs_only_its_figures(report: RunReport) -> None:
+    for empty in [True, False]:
+        for gone in ["velocities", "slip", "windows", "aggregates", "findings"]:
+            tables = {name: frame for name, frame in report.tables.items() if name != gone}
+            if empty:
+                tables[gone] = report.tables[gone].clear()
+            outline = outline_of(
+                render_report(RunReport(report.summary, tables, report.diagnosis, report.motion))
+            )
+            drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
+            lost: dict[str, set[str]] = {
+                "velocities": {"trajectory", "paths", "stretch"},
+                "slip": {"modulus", "distribution", "command_space", "navigator", "step_response", "stretch"},
+                "windows": {"window_norms"},
+                "aggregates": {"split"},
+                "findings": set(),
+            }
+            assert set(list_places()) - drawn == lost[gone]
+            assert "h2 How much slip" in outline.headings
 
 
 def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:

@@ -13,24 +13,24 @@ from schemas import Contract, contract_of, list_contracts
 CONTRACTS = list_contracts()
 
 
-@pytest.mark.parametrize("contract", CONTRACTS, ids=lambda contract: contract.name)
-def test_every_column_says_what_it_is(contract: Contract) -> None:
-    columns = contract.schema.columns()
-    assert [name for name in columns if not contract.metadata_of(name).get("description")] == []
+def test_every_column_says_what_it_is() -> None:
+    for contract in CONTRACTS:
+        columns = contract.schema.columns()
+        assert [name for name in columns if not contract.metadata_of(name).get("description")] == []
 
 
-@pytest.mark.parametrize("contract", CONTRACTS, ids=lambda contract: contract.name)
-def test_every_real_number_has_a_unit(contract: Contract) -> None:
-    columns = contract.schema.columns()
-    real = [name for name, column in columns.items() if isinstance(column, dy.Float64)]
-    assert [name for name in real if not contract.metadata_of(name).get("unit")] == []
+def test_every_real_number_has_a_unit() -> None:
+    for contract in CONTRACTS:
+        columns = contract.schema.columns()
+        real = [name for name, column in columns.items() if isinstance(column, dy.Float64)]
+        assert [name for name in real if not contract.metadata_of(name).get("unit")] == []
 
 
-@pytest.mark.parametrize("contract", CONTRACTS, ids=lambda contract: contract.name)
-def test_a_table_is_a_plural_noun_with_a_version_and_knows_its_run(contract: Contract) -> None:
-    assert contract.version >= 1
-    assert contract.name == contract.schema.__name__.lower()
-    assert {"run", "dataset", "vehicle", "terrain"} <= set(contract.schema.columns())
+def test_a_table_is_a_plural_noun_with_a_version_and_knows_its_run() -> None:
+    for contract in CONTRACTS:
+        assert contract.version >= 1
+        assert contract.name == contract.schema.__name__.lower()
+        assert {"run", "dataset", "vehicle", "terrain"} <= set(contract.schema.columns())
 
 
 def test_velocities_and_slip_stand_in_the_body_frame() -> None:
@@ -92,27 +92,23 @@ def broken_rows(table: str, row: dict[str, object]) -> int:
     return len(failure)
 
 
-@pytest.mark.parametrize(
-    ("table", "row"),
-    [
+def test_a_good_row_is_kept() -> None:
+    for table, row in [
         ("poses", POSE),
         ("wheels", WHEEL),
         ("commands", COMMAND),
         ("slip", SLIP),
         ("findings", FINDING),
         ("windows", WINDOW),
-    ],
-)
-def test_a_good_row_is_kept(table: str, row: dict[str, object]) -> None:
-    assert broken_rows(table, row) == 0
+    ]:
+        assert broken_rows(table, row) == 0
 
 
 NAN, INF = float("nan"), float("inf")
 
 
-@pytest.mark.parametrize(
-    ("table", "row", "change"),
-    [
+def test_a_bad_row_is_told() -> None:
+    for table, row, change in [
         ("poses", POSE, {"q_w": 0.0}),
         ("poses", POSE, {"q_w": 0.9}),
         ("poses", POSE, {"x": NAN}),
@@ -133,10 +129,8 @@ NAN, INF = float("nan"), float("inf")
         ("windows", WINDOW, {"samples": 0}),
         ("windows", WINDOW, {"window_norm": -1.0}),
         ("windows", WINDOW, {"window_norm": NAN}),
-    ],
-)
-def test_a_bad_row_is_told(table: str, row: dict[str, object], change: dict[str, object]) -> None:
-    assert broken_rows(table, {**row, **change}) == 1
+    ]:
+        assert broken_rows(table, {**row, **change}) == 1
 
 
 def test_a_car_has_speed_and_steering_in_place_of_wheels() -> None:

@@ -17,7 +17,6 @@ from pipeline.simulate import (
     Ground,
     Program,
     Scenario,
-    Vehicle,
     find_case,
     find_vehicle,
     list_cases,
@@ -62,15 +61,15 @@ def test_every_effect_of_the_catalogue_can_be_asked_for() -> None:
     assert all(item.unit for effect in list_effects() for item in effect.parameters)
 
 
-@pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=lambda vehicle: vehicle.name)
-def test_a_vehicle_has_the_geometry_of_the_preset_that_its_logs_name(vehicle: Vehicle) -> None:
-    preset = Path(__file__).parents[2] / "pipeline" / "sources" / "presets" / f"{vehicle.name}.toml"
-    numbers = tomllib.loads(preset.read_text())
-    assert numbers["kind"] == vehicle.kind
-    assert numbers["wheel_radius_m"] == vehicle.wheel_radius_m
-    assert numbers["track_width_m"] == vehicle.track_width_m
-    if vehicle.kind == "ackermann":
-        assert numbers["wheelbase_m"] == vehicle.wheelbase_m
+def test_a_vehicle_has_the_geometry_of_the_preset_that_its_logs_name() -> None:
+    for vehicle in VEHICLES.values():
+        preset = Path(__file__).parents[2] / "pipeline" / "sources" / "presets" / f"{vehicle.name}.toml"
+        numbers = tomllib.loads(preset.read_text())
+        assert numbers["kind"] == vehicle.kind
+        assert numbers["wheel_radius_m"] == vehicle.wheel_radius_m
+        assert numbers["track_width_m"] == vehicle.track_width_m
+        if vehicle.kind == "ackermann":
+            assert numbers["wheelbase_m"] == vehicle.wheelbase_m
 
 
 def test_changes_are_added_to_a_case() -> None:
@@ -89,10 +88,10 @@ def test_an_empty_effect_means_its_usual_size() -> None:
     assert make_scenario(None, {"icr_offset": {}}).effects["icr_offset"] == {"x_icr": 0.12}
 
 
-@pytest.mark.parametrize("name", [*SLOPE_EFFECTS, "grade_load"])
-def test_an_effect_of_slopes_brings_hills_along(name: str) -> None:
-    assert make_scenario(None, {name: 0.5}).ground.hill_m > 0.0
-    assert make_scenario(None, {}).ground == Ground()
+def test_an_effect_of_slopes_brings_hills_along() -> None:
+    for name in [*SLOPE_EFFECTS, "grade_load"]:
+        assert make_scenario(None, {name: 0.5}).ground.hill_m > 0.0
+        assert make_scenario(None, {}).ground == Ground()
 
 
 def test_a_case_keeps_its_slope() -> None:
@@ -115,28 +114,29 @@ def test_every_case_can_be_made() -> None:
         assert run.poses.stamp_s.size > 50
 
 
-@pytest.mark.parametrize(
-    ("name", "vehicle"),
-    [pair for pair in product(get_args(ProgramName), ("husky", "car", "youbot")) if pair != ("spins", "car")],
-)
-def test_programs_stay_inside_the_command_space_and_repeat(name: str, vehicle: str) -> None:
-    machine = VEHICLES[vehicle]
-    program = Program(name, jitter_s=0.004, speed_scale=0.8, turn_scale=0.5)  # type: ignore[arg-type]
-    first, second = (
-        make_commands(program, machine, duration_s=120.0, generator=open_stream(3, "program"))
-        for _ in range(2)
-    )
-    assert first.time_s.tobytes() == second.time_s.tobytes()
-    assert first.speed_mps.tobytes() == second.speed_mps.tobytes()
-    assert (np.diff(first.time_s) > 0.0).all()
-    assert np.abs(first.speed_mps).max() <= 0.8 * machine.max_speed_mps + 1e-12
-    assert np.abs(first.turn).max() <= 0.5 * max(machine.max_turn_radps, machine.max_steering_rad) + 1e-12
-    assert first.speed_mps.any() or first.turn.any()
-    assert np.abs(first.sideways).max() <= 0.8 * machine.max_sideways_mps + 1e-12
-    assert (first.sideways_mps is None) == (vehicle != "youbot")
-    resting = (first.time_s < 1.9) | (first.time_s > 118.1)
-    assert not first.speed_mps[resting].any()
-    assert not first.turn[resting].any()
+def test_programs_stay_inside_the_command_space_and_repeat() -> None:
+    for name, vehicle in [
+        pair
+        for pair in product(get_args(ProgramName), ("husky", "car", "youbot"))
+        if pair != ("spins", "car")
+    ]:
+        machine = VEHICLES[vehicle]
+        program = Program(name, jitter_s=0.004, speed_scale=0.8, turn_scale=0.5)  # type: ignore[arg-type]
+        first, second = (
+            make_commands(program, machine, duration_s=120.0, generator=open_stream(3, "program"))
+            for _ in range(2)
+        )
+        assert first.time_s.tobytes() == second.time_s.tobytes()
+        assert first.speed_mps.tobytes() == second.speed_mps.tobytes()
+        assert (np.diff(first.time_s) > 0.0).all()
+        assert np.abs(first.speed_mps).max() <= 0.8 * machine.max_speed_mps + 1e-12
+        assert np.abs(first.turn).max() <= 0.5 * max(machine.max_turn_radps, machine.max_steering_rad) + 1e-12
+        assert first.speed_mps.any() or first.turn.any()
+        assert np.abs(first.sideways).max() <= 0.8 * machine.max_sideways_mps + 1e-12
+        assert (first.sideways_mps is None) == (vehicle != "youbot")
+        resting = (first.time_s < 1.9) | (first.time_s > 118.1)
+        assert not first.speed_mps[resting].any()
+        assert not first.turn[resting].any()
 
 
 def test_drive_steps_cover_the_space_both_ways_in_steps_of_six_seconds() -> None:

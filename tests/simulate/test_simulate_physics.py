@@ -40,52 +40,49 @@ def steady_velocity(effects: Asked, scenario: Scenario = CIRCLE) -> Floats:
 INERTIA = 1.0 + (0.5 * W0) ** 2
 
 
-@pytest.mark.parametrize(
-    ("effects", "expected"),
-    [
-        ({}, (V0, 0, W0)),
-        ({"wheel_radius": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
-        ({"wheel_asymmetry": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
-        ({"effective_track": 1.8}, (V0, 0, W0 / 1.8)),
-        ({"icr_offset": 0.12}, (V0, -0.12 * W0, W0)),
-        ({"icr_lateral": 0.1}, (V0 + 0.1 * W0, 0, W0)),
-        ({"lateral_skid": 0.1}, (V0, -0.1 * V0 * W0, W0)),
-        ({"speed_slip": 0.08}, (V0 - 0.08 * V0**2, 0, W0)),
-        ({"turning_resistance": 0.24}, (V0 - 0.24 * V0 * W0, 0, W0)),
-        ({"speed_track": 0.2}, (V0, 0, W0 + 0.2 * V0 * W0)),
-        ({"lateral_drift": 0.05}, (V0, 0.05, W0)),
-        ({"yaw_drift": 0.06}, (V0, 0, W0 + 0.06)),
-        ({"terrain_change": {"k_v": 0.8, "k_w": 0.7, "at_s": 10.0}}, (0.8 * V0, 0, 0.7 * W0)),
-        ({"body_speed_limit": 0.5}, (0.5, 0, W0)),
-        ({"body_turn_limit": 0.4}, (V0, 0, 0.4)),
-        # The right wheel runs at (0.6 + 0.6 * 0.275) / 0.165 = 4.636 rad/s, the left one at 2.636.
-        ({"wheel_speed_limit": 4.0}, ((0.435 + 0.66) / 2, 0, (0.66 - 0.435) / 0.55)),
-        ({"wheel_speed_scaling": 4.0}, (V0 * 0.66 / 0.765, 0, W0 * 0.66 / 0.765)),
-        ({"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
-        ({"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
-        ({"drive_gain": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
-        ({"load_droop": 0.05}, (V0 - 0.05, 0, W0)),
-        ({"difference_gain": 0.5}, (V0, 0, 0.5 * W0)),
-        ({"side_gain": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
-        ({"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),
-        ({"tyre_torsion": {"tau": 0.1, "damping": 0.3}}, (V0, 0, W0)),
-        # The order of a command's way: the track changes w0, and only then inertia and skid look at it.
-        (
-            {"effective_track": 1.5, "lateral_skid": 0.1, "icr_offset": 0.1},
-            (V0, -0.1 * V0 * 0.4 - 0.1 * 0.4, 0.4),
-        ),
-        (
-            {"body_inertia": 0.5, "lateral_skid": 0.1},
-            (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA - 0.1 * V0 * W0, W0),
-        ),
-        ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (V0, 0, W0)),
-    ],
-    ids=str,
-)
-def test_steady_circle_has_the_velocity_of_the_formula(
-    effects: Asked, expected: tuple[float, float, float]
-) -> None:
-    np.testing.assert_allclose(steady_velocity(effects), expected, atol=1e-6)
+STEADY: list[tuple[Asked, tuple[float, float, float]]] = [
+    ({}, (V0, 0, W0)),
+    ({"wheel_radius": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
+    ({"wheel_asymmetry": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
+    ({"effective_track": 1.8}, (V0, 0, W0 / 1.8)),
+    ({"icr_offset": 0.12}, (V0, -0.12 * W0, W0)),
+    ({"icr_lateral": 0.1}, (V0 + 0.1 * W0, 0, W0)),
+    ({"lateral_skid": 0.1}, (V0, -0.1 * V0 * W0, W0)),
+    ({"speed_slip": 0.08}, (V0 - 0.08 * V0**2, 0, W0)),
+    ({"turning_resistance": 0.24}, (V0 - 0.24 * V0 * W0, 0, W0)),
+    ({"speed_track": 0.2}, (V0, 0, W0 + 0.2 * V0 * W0)),
+    ({"lateral_drift": 0.05}, (V0, 0.05, W0)),
+    ({"yaw_drift": 0.06}, (V0, 0, W0 + 0.06)),
+    ({"terrain_change": {"k_v": 0.8, "k_w": 0.7, "at_s": 10.0}}, (0.8 * V0, 0, 0.7 * W0)),
+    ({"body_speed_limit": 0.5}, (0.5, 0, W0)),
+    ({"body_turn_limit": 0.4}, (V0, 0, 0.4)),
+    # The right wheel runs at (0.6 + 0.6 * 0.275) / 0.165 = 4.636 rad/s, the left one at 2.636.
+    ({"wheel_speed_limit": 4.0}, ((0.435 + 0.66) / 2, 0, (0.66 - 0.435) / 0.55)),
+    ({"wheel_speed_scaling": 4.0}, (V0 * 0.66 / 0.765, 0, W0 * 0.66 / 0.765)),
+    ({"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
+    ({"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
+    ({"drive_gain": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
+    ({"load_droop": 0.05}, (V0 - 0.05, 0, W0)),
+    ({"difference_gain": 0.5}, (V0, 0, 0.5 * W0)),
+    ({"side_gain": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
+    ({"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),
+    ({"tyre_torsion": {"tau": 0.1, "damping": 0.3}}, (V0, 0, W0)),
+    # The order of a command's way: the track changes w0, and only then inertia and skid look at it.
+    (
+        {"effective_track": 1.5, "lateral_skid": 0.1, "icr_offset": 0.1},
+        (V0, -0.1 * V0 * 0.4 - 0.1 * 0.4, 0.4),
+    ),
+    (
+        {"body_inertia": 0.5, "lateral_skid": 0.1},
+        (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA - 0.1 * V0 * W0, W0),
+    ),
+    ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (V0, 0, W0)),
+]
+
+
+def test_steady_circle_has_the_velocity_of_the_formula() -> None:
+    for effects, expected in STEADY:
+        np.testing.assert_allclose(steady_velocity(effects), expected, atol=1e-6, err_msg=str(effects))
 
 
 def test_ground_effects_may_act_on_what_inertia_made() -> None:
@@ -102,38 +99,35 @@ LEVER, RADIUS = 0.5 * (0.3 + 0.47), 0.0475
 SLIDING = (AHEAD + 1j * ASIDE) / (1.0 + 0.5j * AROUND)
 
 
-@pytest.mark.parametrize(
-    ("effects", "expected"),
-    [
-        ({}, (AHEAD, ASIDE, AROUND)),
-        ({"lateral_scale": 0.8}, (AHEAD, 0.8 * ASIDE, AROUND)),
-        ({"roller_slip": 0.3}, (AHEAD, ASIDE - 0.3 * ASIDE**2, AROUND)),
-        ({"lateral_scale": 0.8, "roller_slip": 0.3}, (AHEAD, 0.8 * ASIDE - 0.3 * (0.8 * ASIDE) ** 2, AROUND)),
-        ({"effective_track": 1.2}, (AHEAD, ASIDE, AROUND / 1.2)),
-        ({"wheel_radius": 0.9}, (0.9 * AHEAD, 0.9 * ASIDE, 0.9 * AROUND)),
-        (
-            {"wheel_asymmetry": 0.1},
-            (AHEAD + 0.05 * LEVER * AROUND, ASIDE, AROUND + 0.05 * AHEAD / LEVER),
-        ),
-        (
-            {"lateral_skid": 0.1},
-            (AHEAD + 0.1 * ASIDE * AROUND, ASIDE - 0.1 * AHEAD * AROUND, AROUND),
-        ),
-        ({"body_inertia": 0.5}, (SLIDING.real, SLIDING.imag, AROUND)),
-        ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (AHEAD, ASIDE, AROUND)),
-        # Rims turn at 0 -+ 0.2772 and 0.96 -+ 0.2772 m/s; only the front right one is held back, to 0.95 m/s.
-        (
-            {"wheel_speed_limit": 0.95 / RADIUS},
-            (0.4082, 0.4082, (2 * 0.2772 + 0.95 - 0.6828) / 4 / LEVER),
-        ),
-    ],
-    ids=str,
-)
-def test_mecanum_wheels_move_sideways_by_the_formula(
-    effects: Asked, expected: tuple[float, float, float]
-) -> None:
-    found = steady_velocity(effects, replace(CIRCLE, vehicle=YOUBOT))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+SIDEWAYS: list[tuple[Asked, tuple[float, float, float]]] = [
+    ({}, (AHEAD, ASIDE, AROUND)),
+    ({"lateral_scale": 0.8}, (AHEAD, 0.8 * ASIDE, AROUND)),
+    ({"roller_slip": 0.3}, (AHEAD, ASIDE - 0.3 * ASIDE**2, AROUND)),
+    ({"lateral_scale": 0.8, "roller_slip": 0.3}, (AHEAD, 0.8 * ASIDE - 0.3 * (0.8 * ASIDE) ** 2, AROUND)),
+    ({"effective_track": 1.2}, (AHEAD, ASIDE, AROUND / 1.2)),
+    ({"wheel_radius": 0.9}, (0.9 * AHEAD, 0.9 * ASIDE, 0.9 * AROUND)),
+    (
+        {"wheel_asymmetry": 0.1},
+        (AHEAD + 0.05 * LEVER * AROUND, ASIDE, AROUND + 0.05 * AHEAD / LEVER),
+    ),
+    (
+        {"lateral_skid": 0.1},
+        (AHEAD + 0.1 * ASIDE * AROUND, ASIDE - 0.1 * AHEAD * AROUND, AROUND),
+    ),
+    ({"body_inertia": 0.5}, (SLIDING.real, SLIDING.imag, AROUND)),
+    ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (AHEAD, ASIDE, AROUND)),
+    # Rims turn at 0 -+ 0.2772 and 0.96 -+ 0.2772 m/s; only the front right one is held back, to 0.95 m/s.
+    (
+        {"wheel_speed_limit": 0.95 / RADIUS},
+        (0.4082, 0.4082, (2 * 0.2772 + 0.95 - 0.6828) / 4 / LEVER),
+    ),
+]
+
+
+def test_mecanum_wheels_move_sideways_by_the_formula() -> None:
+    for effects, expected in SIDEWAYS:
+        found = steady_velocity(effects, replace(CIRCLE, vehicle=YOUBOT))
+        np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=str(effects))
 
 
 def test_omni_wheels_turn_about_their_circle() -> None:
@@ -157,25 +151,24 @@ def test_every_mecanum_wheel_has_an_encoder_of_its_own() -> None:
 DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
 
 
-@pytest.mark.parametrize(
-    ("effects", "rate"),
-    [
-        ({}, SPEED * math.tan(DELTA) / 2.6),
-        ({"steering_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
-        ({"steering_sensor_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
-        ({"steering_gain": 0.8}, SPEED * math.tan(0.8 * DELTA) / 2.6),
-        ({"understeer": 0.03}, SPEED * math.tan(DELTA) / (2.6 + 0.03 * SPEED**2)),
-        ({"effective_wheelbase": 1.2}, SPEED * math.tan(DELTA) / (1.2 * 2.6)),
-        ({"steering_lag": 0.4}, SPEED * math.tan(DELTA) / 2.6),
-        ({"steering_rate_limit": 0.3}, SPEED * math.tan(DELTA) / 2.6),
-        ({"steering_sensor_play": 0.05}, SPEED * math.tan(DELTA - 0.05) / 2.6),
-        ({"body_turn_limit": 0.5}, 0.5),
-    ],
-    ids=str,
-)
-def test_a_car_turns_as_the_bicycle_model_says(effects: Asked, rate: float) -> None:
-    car = replace(CIRCLE, vehicle=CAR)
-    np.testing.assert_allclose(steady_velocity(effects, car), (SPEED, 0.0, rate), atol=1e-6)
+STEERED: list[tuple[Asked, float]] = [
+    ({}, SPEED * math.tan(DELTA) / 2.6),
+    ({"steering_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
+    ({"steering_sensor_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
+    ({"steering_gain": 0.8}, SPEED * math.tan(0.8 * DELTA) / 2.6),
+    ({"understeer": 0.03}, SPEED * math.tan(DELTA) / (2.6 + 0.03 * SPEED**2)),
+    ({"effective_wheelbase": 1.2}, SPEED * math.tan(DELTA) / (1.2 * 2.6)),
+    ({"steering_lag": 0.4}, SPEED * math.tan(DELTA) / 2.6),
+    ({"steering_rate_limit": 0.3}, SPEED * math.tan(DELTA) / 2.6),
+    ({"steering_sensor_play": 0.05}, SPEED * math.tan(DELTA - 0.05) / 2.6),
+    ({"body_turn_limit": 0.5}, 0.5),
+]
+
+
+def test_a_car_turns_as_the_bicycle_model_says() -> None:
+    for effects, rate in STEERED:
+        found = steady_velocity(effects, replace(CIRCLE, vehicle=CAR))
+        np.testing.assert_allclose(found, (SPEED, 0.0, rate), atol=1e-6, err_msg=str(effects))
 
 
 def test_a_circle_has_the_radius_of_speed_over_rate() -> None:
@@ -338,48 +331,19 @@ def test_the_controller_stops_some_time_after_the_last_command() -> None:
     assert moving == pytest.approx(0.25, abs=0.01)
 
 
-@pytest.mark.parametrize("name", sorted(CATALOGUE))
-def test_neutral_parameters_change_nothing_bit_for_bit(name: str) -> None:
-    spec = CATALOGUE[name]
-    neutral = {item.name: item.neutral for item in spec.parameters if not math.isnan(item.neutral)}
-    vehicle = BY_KIND[spec.kinds[0]]
+def test_neutral_parameters_change_nothing_bit_for_bit() -> None:
+    lagging: Asked = {"drive_lag": 0.3}
     base = Scenario(
-        vehicle=vehicle,
-        duration_s=12.0,
-        disturbance=Disturbance(0.03, 0.05),
-        ground=Ground(pitch_rad=0.1),
-        effects={"drive_lag": 0.3},
+        duration_s=12.0, disturbance=Disturbance(0.03, 0.05), ground=Ground(pitch_rad=0.1), effects=lagging
     )
-    plain, with_it = (
-        simulate_run(replace(base, effects=given))
-        for given in ({"drive_lag": 0.3}, neutral_set(name, neutral))
-    )
-    assert plain.truth.path.position.tobytes() == with_it.truth.path.position.tobytes()
-    assert plain.poses.quaternion.tobytes() == with_it.poses.quaternion.tobytes()
-    assert plain.poses.stamp_s.tobytes() == with_it.poses.stamp_s.tobytes()
-
-
-def neutral_set(name: str, neutral: dict[str, float]) -> Asked:
-    return {"drive_lag": 0.3} if name == "drive_lag" else {"drive_lag": 0.3, name: neutral}
-
-
-@pytest.mark.parametrize("name", sorted(CATALOGUE))
-def test_a_usual_size_of_every_effect_moves_what_is_reported(name: str) -> None:
-    spec = CATALOGUE[name]
-    usual = {item.name: item.typical for item in spec.parameters if not math.isnan(item.typical)}
-    vehicle = BY_KIND[spec.kinds[0]]
-    # Motors differ where a servo drives them.
-    servo = (
-        {"wheel_servo": {"tau": 0.3, "bound": 0.3, "no_load": 1.0, "scrub": 0.5}}
-        if name == "motor_imbalance"
-        else {}
-    )
-    base = Scenario(vehicle=vehicle, duration_s=30.0, ground=Ground(pitch_rad=0.15), effects=servo)
-    plain, with_it = simulate_run(base), simulate_run(replace(base, effects={**servo, name: usual}))
-    moved = np.abs(plain.poses.position - with_it.poses.position).max()
-    turned = np.abs(plain.poses.quaternion - with_it.poses.quaternion).max()
-    shifted = np.abs(plain.poses.stamp_s - with_it.poses.stamp_s).max()
-    assert max(moved, turned, shifted) > 0.02
+    plain = {kind: simulate_run(replace(base, vehicle=vehicle)) for kind, vehicle in BY_KIND.items()}
+    for name, spec in CATALOGUE.items():
+        neutral = {item.name: item.neutral for item in spec.parameters if not math.isnan(item.neutral)}
+        without = plain[spec.kinds[0]]
+        added = simulate_run(replace(without.scenario, effects={name: neutral, **lagging}))
+        assert without.truth.path.position.tobytes() == added.truth.path.position.tobytes(), name
+        assert without.poses.quaternion.tobytes() == added.poses.quaternion.tobytes(), name
+        assert without.poses.stamp_s.tobytes() == added.poses.stamp_s.tobytes(), name
 
 
 def test_both_integrators_agree_on_a_plane() -> None:

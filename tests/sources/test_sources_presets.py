@@ -2,40 +2,35 @@
 
 import pytest
 
-from pipeline.sources import ConfigurationError, Vehicle, find_preset, list_presets, resolve_vehicle
+from pipeline.sources import ConfigurationError, find_preset, list_presets, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 
 PRESETS = list_presets()
 
 
-@pytest.mark.parametrize("vehicle", PRESETS, ids=lambda vehicle: vehicle.id)
-def test_a_preset_has_the_geometry_of_its_ideal_model(vehicle: Vehicle) -> None:
-    needed = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
-    assert all(getattr(vehicle, name) for name in needed)
-    assert 0.01 < vehicle.wheel_radius_m < 1.0
+def test_a_preset_has_the_geometry_of_its_ideal_model() -> None:
+    for vehicle in PRESETS:
+        needed = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+        assert all(getattr(vehicle, name) for name in needed)
+        assert 0.01 < vehicle.wheel_radius_m < 1.0
 
 
-@pytest.mark.parametrize("vehicle", PRESETS, ids=lambda vehicle: vehicle.id)
-def test_a_preset_is_found_by_id_and_alias_however_they_are_written(vehicle: Vehicle) -> None:
-    for name in (vehicle.id, *vehicle.aliases):
-        assert find_preset(name) == vehicle
-        assert find_preset(f" {name.upper().replace('_', '-')} ") == vehicle
+def test_a_preset_is_found_by_id_and_alias_however_they_are_written() -> None:
+    for vehicle in PRESETS:
+        for name in (vehicle.id, *vehicle.aliases):
+            assert find_preset(name) == vehicle
+            assert find_preset(f" {name.upper().replace('_', '-')} ") == vehicle
 
 
-@pytest.mark.parametrize(
-    ("name", "radius", "track", "mass"),
-    [
+def test_published_vehicles_have_their_published_numbers() -> None:
+    for name, radius, track, mass in [
         ("husky_a200", 0.165, 0.55, 75.0),
         ("warthog", 0.30, 1.08, 470.0),
         ("marmotte_hd2", 0.116, 0.5927, None),
-    ],
-)
-def test_published_vehicles_have_their_published_numbers(
-    name: str, radius: float, track: float, mass: float | None
-) -> None:
-    vehicle = find_preset(name)
-    assert vehicle is not None
-    assert (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.mass_kg) == (radius, track, mass)
+    ]:
+        vehicle = find_preset(name)
+        assert vehicle is not None
+        assert (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.mass_kg) == (radius, track, mass)
 
 
 def test_the_log_names_the_vehicle_when_nobody_else_does() -> None:

@@ -60,9 +60,9 @@ def judge(error: SlipError, keys: tuple[str, ...], path: Path, what: str = "") -
     assert len(str(error)) < 1000
 
 
-@pytest.mark.parametrize(("keys", "bounds"), [*CONFIGURED, *LIMITED, *VEHICLES], ids=str)
-def test_every_number_has_a_finite_range(keys: tuple[str, ...], bounds: tuple[float, float]) -> None:
-    assert -1e300 < bounds[0] < bounds[1] < 1e300, keys
+def test_every_number_has_a_finite_range() -> None:
+    for keys, bounds in [*CONFIGURED, *LIMITED, *VEHICLES]:
+        assert -1e300 < bounds[0] < bounds[1] < 1e300, keys
 
 
 def test_the_numbers_are_found() -> None:

@@ -75,9 +75,8 @@ def test_a_car_turns_its_wheels_as_far_as_its_description_says(limit: str, large
     assert recognized.vehicle.max_steering_rad == largest
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_a_text_with_entities_or_without_wheels_is_no_description() -> None:
+    for text in [
         "",
         "no xml",
         "<robot/>",
@@ -86,16 +85,12 @@ def test_a_car_turns_its_wheels_as_far_as_its_description_says(limit: str, large
         BURGER.format(shape=CYLINDER).replace(
             '<parent link="base_link"/>', '<parent link="wheel_left_link"/>'
         ),
-    ],
-    ids=["empty", "text", "no wheels", "entities", "a place that is none", "a circle of links"],
-)
-def test_a_text_with_entities_or_without_wheels_is_no_description(text: str) -> None:
-    assert read_description(text) is None
+    ]:
+        assert read_description(text) is None
 
 
-@pytest.mark.parametrize(
-    ("topic", "vehicle"),
-    [
+def test_a_namespace_tells_the_platform() -> None:
+    for topic, vehicle in [
         ("/a200_0042/platform/cmd_vel", "husky_a200"),
         ("/j100_0001/cmd_vel", "jackal"),
         ("/panther/cmd_vel", "panther"),
@@ -103,12 +98,10 @@ def test_a_text_with_entities_or_without_wheels_is_no_description(text: str) -> 
         ("/rosbot/cmd_vel", "rosbot_2r"),
         # Of words within each other the longest counts.
         ("/rosbot_xl/cmd_vel", "rosbot_xl"),
-    ],
-)
-def test_a_namespace_tells_the_platform(topic: str, vehicle: str) -> None:
-    found = recognize(topic)
-    assert found is not None
-    assert (found.vehicle.id, found.source) == (vehicle, "namespace")
+    ]:
+        found = recognize(topic)
+        assert found is not None
+        assert (found.vehicle.id, found.source) == (vehicle, "namespace")
 
 
 def test_mecanum_wheels_are_told_by_a_description_that_speaks_of_them() -> None:

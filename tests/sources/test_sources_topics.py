@@ -219,14 +219,14 @@ OF_WHEELS = (
 )
 
 
-@pytest.mark.parametrize("topic", OF_WHEELS)
-def test_a_word_in_the_robots_name_makes_wheel_odometry_no_localization(topic: str) -> None:
-    sources = choose({"/cmd_vel": TWIST, topic: ODOMETRY, "/robot/pose": POSE})
-    assert names(sources) == {"command": "/cmd_vel", "wheels": topic, "pose": "/robot/pose", "imu": None}
-    # Where there is no other, it is taken for what it is.
-    alone = choose({"/cmd_vel": TWIST, topic: ODOMETRY}).pose
-    assert alone is not None
-    assert "comes from the wheels" in alone.reason
+def test_a_word_in_the_robots_name_makes_wheel_odometry_no_localization() -> None:
+    for topic in OF_WHEELS:
+        sources = choose({"/cmd_vel": TWIST, topic: ODOMETRY, "/robot/pose": POSE})
+        assert names(sources) == {"command": "/cmd_vel", "wheels": topic, "pose": "/robot/pose", "imu": None}
+        # Where there is no other, it is taken for what it is.
+        alone = choose({"/cmd_vel": TWIST, topic: ODOMETRY}).pose
+        assert alone is not None
+        assert "comes from the wheels" in alone.reason
 
 
 LOCALIZATIONS = (
@@ -235,38 +235,42 @@ LOCALIZATIONS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("topic", LOCALIZATIONS)
-def test_a_localization_is_told_by_its_name(topic: str) -> None:
-    pose = choose({"/cmd_vel": TWIST, topic: ODOMETRY, "/robot/pose": POSE}).pose
-    assert pose is not None
-    assert (pose.topic, pose.reason) == (topic, "a localization by its name")
+def test_a_localization_is_told_by_its_name() -> None:
+    for topic in LOCALIZATIONS:
+        pose = choose({"/cmd_vel": TWIST, topic: ODOMETRY, "/robot/pose": POSE}).pose
+        assert pose is not None
+        assert (pose.topic, pose.reason) == (topic, "a localization by its name")
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_every_simulated_layout_is_understood(name: str) -> None:
-    layout = LAYOUTS[name]
-    types = {
-        "joint_state": JOINTS,
-        "float_sides": FLOAT,
-        "float_speed_steering": FLOAT,
-        "twist": TWIST,
-        "twist_stamped": STAMPED,
-        "ackermann": DRIVE,
-        "odometry": ODOMETRY,
-        "pose_stamped": POSE,
-        "pose_covariance": POSE_COVARIANCE,
-        "tf": TF,
-    }
-    topics = {topic: types[each.form] for each in (*layout.commands, *layout.wheels) for topic in each.topics}
-    topics |= {layout.pose.topic: types[layout.pose.form]} | ({layout.imu: IMU} if layout.imu else {})
-    sources = choose(topics, "ackermann_car" if layout.kind == "ackermann" else "husky")
-    assert sources.command is not None
-    assert tuple(dict.fromkeys(each.topic for each in sources.command.signals)) == layout.commands[0].topics
-    signals = () if sources.wheels is None else sources.wheels.signals
-    measured = tuple(dict.fromkeys(signal.topic for signal in signals))
-    assert measured == (layout.wheels[0].topics if layout.wheels else ())
-    assert sources.pose is not None
-    assert sources.pose.topic == layout.pose.topic
+def test_every_simulated_layout_is_understood() -> None:
+    for name in LAYOUTS:
+        layout = LAYOUTS[name]
+        types = {
+            "joint_state": JOINTS,
+            "float_sides": FLOAT,
+            "float_speed_steering": FLOAT,
+            "twist": TWIST,
+            "twist_stamped": STAMPED,
+            "ackermann": DRIVE,
+            "odometry": ODOMETRY,
+            "pose_stamped": POSE,
+            "pose_covariance": POSE_COVARIANCE,
+            "tf": TF,
+        }
+        topics = {
+            topic: types[each.form] for each in (*layout.commands, *layout.wheels) for topic in each.topics
+        }
+        topics |= {layout.pose.topic: types[layout.pose.form]} | ({layout.imu: IMU} if layout.imu else {})
+        sources = choose(topics, "ackermann_car" if layout.kind == "ackermann" else "husky")
+        assert sources.command is not None
+        assert (
+            tuple(dict.fromkeys(each.topic for each in sources.command.signals)) == layout.commands[0].topics
+        )
+        signals = () if sources.wheels is None else sources.wheels.signals
+        measured = tuple(dict.fromkeys(signal.topic for signal in signals))
+        assert measured == (layout.wheels[0].topics if layout.wheels else ())
+        assert sources.pose is not None
+        assert sources.pose.topic == layout.pose.topic
 
 
 def test_what_is_configured_is_taken_whatever_it_is_called() -> None:

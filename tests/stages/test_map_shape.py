@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from few import few
 from stage_logs import FIELD, TakeThrough
 
 from pipeline.simulate import Ground, Program, Scenario, simulate_run
@@ -38,14 +39,24 @@ def test_a_map_of_another_scale_is_the_wheels_radius(drive: TakeThrough) -> None
 
 @pytest.mark.parametrize(
     "more",
-    [
-        {},
-        {
-            "ground": Ground(pitch_rad=0.12),
-            "effects": {"drive_lag": 0.3, "slope_creep": 0.6, "side_slope_creep": 0.6},
-        },
-        {"effects": {"drive_lag": 0.3, "effective_track": 1.8, "speed_slip": 0.1, "turning_resistance": 0.2}},
-    ],
+    few(
+        [
+            {},
+            {
+                "ground": Ground(pitch_rad=0.12),
+                "effects": {"drive_lag": 0.3, "slope_creep": 0.6, "side_slope_creep": 0.6},
+            },
+            {
+                "effects": {
+                    "drive_lag": 0.3,
+                    "effective_track": 1.8,
+                    "speed_slip": 0.1,
+                    "turning_resistance": 0.2,
+                }
+            },
+        ],
+        2,
+    ),
     ids=["plain", "slope", "slip"],
 )
 def test_an_even_map_is_not_told_of(drive: TakeThrough, more: dict[str, object]) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from few import few
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -129,7 +130,7 @@ def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Pat
     return path
 
 
-@pytest.mark.parametrize("kind", TRACTION)
+@pytest.mark.parametrize("kind", few(TRACTION, 2))
 def test_an_event_of_a_log_stands_in_its_table_its_findings_and_its_report(
     tmp_path: Path, kind: IncidentKind
 ) -> None:

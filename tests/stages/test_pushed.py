@@ -5,6 +5,7 @@ from typing import cast
 import numpy as np
 import polars as pl
 import pytest
+from few import few
 from motion_runs import vehicle_of
 
 from pipeline.core import Floats
@@ -62,7 +63,7 @@ def push(start: float, seconds: float, metres: float) -> Floats:
     ("rolls", "counted", "kind"),
     [(False, True, "pushed"), (True, True, "manual_driving"), (False, False, "manual_driving")],
 )
-@pytest.mark.parametrize(("metres", "seconds"), [(0.11, 2.0), (-0.3, 2.0), (0.2, 1.5), (0.2, 1.0)])
+@pytest.mark.parametrize(("metres", "seconds"), few([(0.11, 2.0), (-0.3, 2.0), (0.2, 1.5), (0.2, 1.0)], 2))
 def test_who_pushes_a_robot_is_found_with_its_times(
     metres: float, seconds: float, kind: str, *, rolls: bool, counted: bool
 ) -> None:

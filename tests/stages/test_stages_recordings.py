@@ -5,6 +5,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from few import few
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -74,7 +75,7 @@ def summarize(name: str, results: Path) -> dict[str, object]:
     return dict(analyze_log(LOGS / f"{name}.mcap", Options(out=results, report=False)).summary)
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", few(KNOWN, 7))
 def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, recorded_results: Path) -> None:
     known = KNOWN[name]
     summary = summarize(name, recorded_results)
@@ -122,6 +123,7 @@ def test_a_husky_that_stands_on_a_plank_is_not_moving_and_its_encoders_say_zero(
     assert measured["median_modulus"] < 0.01
 
 
+@pytest.mark.long
 def test_snow_commands_are_off_by_the_ratio_of_two_radii(recorded_results: Path) -> None:
     summary = analyze_log(
         LOGS / "husky_snow_boreal.mcap", Options(out=recorded_results, report=False)
@@ -136,7 +138,9 @@ def test_snow_commands_are_off_by_the_ratio_of_two_radii(recorded_results: Path)
     assert "another vehicle (Clearpath Warthog: wheel radius 0.3 m, track 1.08 m)" in found["text"]
 
 
-@pytest.mark.parametrize("name", ["husky_wheels_wetgrass", "warthog_wheels_asphalt_2024_9_20_8h13s12"])
+@pytest.mark.parametrize(
+    "name", few(["husky_wheels_wetgrass", "warthog_wheels_asphalt_2024_9_20_8h13s12"], 2)
+)
 def test_driving_by_hand_outside_the_protocol_is_noticed(name: str, tmp_path: Path) -> None:
     options = Options(out=tmp_path, report=False, overrides={"use_intervals": "all"})
     findings = analyze_log(LOGS / f"{name}.mcap", options).summary["findings"]

@@ -22,6 +22,9 @@ MOMENTS += [("new", "file_written", count) for count in range(1, FILES + 1)]
 MOMENTS += [("old", step, 1) for step in STEPS[STEPS.index("folder_synced") :]]
 """Key, step and count; before the commit it does not matter whether the key is the current one."""
 
+BOTH_SIDES = {("new", "manifest_written", 1), ("new", "manifest_replaced", 1)}
+"""Of these moments `make test` asks, of the others `make test-long`."""
+
 
 def assert_tidy(store: Store) -> None:
     manifest = store.manifest(RUN)
@@ -45,7 +48,11 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return tables_of(store)
 
 
-@pytest.mark.parametrize("moment", MOMENTS, ids=lambda moment: "-".join(map(str, moment)))
+@pytest.mark.parametrize(
+    "moment",
+    [pytest.param(one, marks=[] if one in BOTH_SIDES else pytest.mark.long) for one in MOMENTS],
+    ids=lambda moment: "-".join(map(str, moment)),
+)
 def test_killed_at_a_step_the_run_is_whole_and_can_be_finished(
     store: Store, start_writer: StartWriter, undisturbed: dict[str, bytes], moment: tuple[str, str, int]
 ) -> None:
@@ -88,6 +95,7 @@ def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed
     assert_tidy(store)
 
 
+@pytest.mark.long
 def test_killed_at_random_moments_the_run_is_whole(store: Store, start_writer: StartWriter) -> None:
     kill_at_random(store, start_writer, rounds=10, seed=7)
 

@@ -114,13 +114,13 @@ def test_run_named_like_a_generation_is_refused(store: Store) -> None:
     assert store.runs() == ("a", "b", "b/0123abcd")
 
 
-@pytest.mark.parametrize("key", ["", ".", "..", "a/b", "a.2", "-a", "a" * 65, "é"])
-def test_keys_are_plain_words(key: str) -> None:
-    with pytest.raises(StoreError):
-        check_key(key)
+def test_keys_are_plain_words() -> None:
+    for key in ["", ".", "..", "a/b", "a.2", "-a", "a" * 65, "é"]:
+        with pytest.raises(StoreError):
+            check_key(key)
 
 
-@pytest.mark.parametrize("name", ["", "../x", "/x", "a//b", ".hidden", "a/.b", "a\0", "a\nb", "x" * 101])
-def test_file_names_stay_inside(name: str) -> None:
-    with pytest.raises(StoreError):
-        check_file_name(name)
+def test_file_names_stay_inside() -> None:
+    for name in ["", "../x", "/x", "a//b", ".hidden", "a/.b", "a\0", "a\nb", "x" * 101]:
+        with pytest.raises(StoreError):
+            check_file_name(name)

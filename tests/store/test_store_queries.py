@@ -19,12 +19,12 @@ from pipeline.store.parquet_tables import check_table, schema_of
 from schemas import list_contracts
 
 
-@pytest.mark.parametrize("contract", list_contracts(), ids=lambda contract: contract.name)
-def test_no_runs_give_the_columns_of_the_contract(store: Store, contract: object) -> None:
-    name = contract.name  # type: ignore[attr-defined]
-    assert store.scan(name).collect().equals(schema_of(name).to_frame())
-    sql = f"SELECT count(*) AS n FROM {name}"  # noqa: S608 - the name is one of ours
-    assert store.query(sql)["n"].to_list() == [0]
+def test_no_runs_give_the_columns_of_the_contract(store: Store) -> None:
+    for contract in list_contracts():
+        name = contract.name  # type: ignore[attr-defined]
+        assert store.scan(name).collect().equals(schema_of(name).to_frame())
+        sql = f"SELECT count(*) AS n FROM {name}"  # noqa: S608 - the name is one of ours
+        assert store.query(sql)["n"].to_list() == [0]
 
 
 def test_scan_sees_the_current_generation_of_every_run(store: Store) -> None:

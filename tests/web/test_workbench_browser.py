@@ -73,6 +73,7 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
     chrome: Chrome, workbench: Workbench, pictures: Path
 ) -> None:
@@ -121,6 +122,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
     chrome: Chrome, workbench: Workbench
 ) -> None:
@@ -142,9 +144,10 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
     assert errors == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("width", "dark"),
-    [(PHONE, False), pytest.param(LAPTOP, True, marks=pytest.mark.long)],
+    [(PHONE, False), (LAPTOP, True)],
     ids=["phone", "laptop-dark"],
 )
 def test_nothing_is_cut_or_overlaps(
@@ -183,6 +186,7 @@ def test_nothing_is_cut_or_overlaps(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
     folder = tmp_path / "<b onclick=alert(1)>field"
     folder.mkdir()
@@ -230,6 +234,7 @@ def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictur
         server.close()
 
 
+@pytest.mark.long
 def test_an_empty_folder_asks_for_a_log(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
     server = Workbench(tmp_path / "nothing yet")
     try:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from few import few
 
 from pipeline.core import SlipError
 from pipeline.logs import columns, index, schema
@@ -43,7 +44,7 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
 }
 
 
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("reader", few(READERS, 4))
 def test_a_megabyte_is_read_or_refused_in_a_moment(reader: str) -> None:
     start, read = READERS[reader]
     for piece in PIECES:

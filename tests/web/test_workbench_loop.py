@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import cast
 
+import pytest
 from chrome import LAPTOP, PHONE, Chrome
 from workbench_server import ERROR, RUN, SHOWN, Workbench, look_for_trouble
 
@@ -21,6 +22,7 @@ MARKED = "[...document.querySelectorAll('.cursor-mark')].map((mark) => mark.pare
 SAID = "document.querySelector('.moment-said').textContent"
 
 
+@pytest.mark.long
 def test_on_a_phone_the_next_effect_is_in_reach_and_the_end_is_said(
     chrome: Chrome, workbench: Workbench, pictures: Path
 ) -> None:
@@ -44,6 +46,7 @@ def test_on_a_phone_the_next_effect_is_in_reach_and_the_end_is_said(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_one_moment_shows_in_path_velocities_and_map_and_can_be_played(
     chrome: Chrome, shared_workbench: Workbench
 ) -> None:
@@ -62,6 +65,7 @@ def test_one_moment_shows_in_path_velocities_and_map_and_can_be_played(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_a_notice_does_not_stand_over_the_next_step(chrome: Chrome, workbench: Workbench) -> None:
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
@@ -76,6 +80,7 @@ def test_a_notice_does_not_stand_over_the_next_step(chrome: Chrome, workbench: W
     chrome.wait("document.querySelector('.card') && document.getElementById('toast').hidden")
 
 
+@pytest.mark.long
 def test_why_a_formula_was_refused_stays_until_the_next_step(chrome: Chrome, workbench: Workbench) -> None:
     chrome.size(LAPTOP, 900)
     chrome.open(workbench.address)
@@ -92,6 +97,7 @@ def test_why_a_formula_was_refused_stays_until_the_next_step(chrome: Chrome, wor
     chrome.errors.clear()
 
 
+@pytest.mark.long
 def test_of_a_run_that_cannot_show_slip_no_error_is_said_to_remain(chrome: Chrome, tmp_path: Path) -> None:
     log = simulate_case(None, {"wheel_radius": 0.0}, out=tmp_path / "field" / "lifted.mcap", duration_s=40.0)
     husky = {"vehicle": {"preset": "husky_a200"}}
@@ -104,6 +110,7 @@ def test_of_a_run_that_cannot_show_slip_no_error_is_said_to_remain(chrome: Chrom
         chrome.open("about:blank")
 
 
+@pytest.mark.long
 def test_it_opens_with_the_run_that_was_analyzed_last(chrome: Chrome, results: Path, tmp_path: Path) -> None:
     log = simulate_case("husky_tile", out=tmp_path / "field" / "later.mcap", duration_s=30.0)
     analyze_log(log, Options(out=results, report=False, diagnosis=False))

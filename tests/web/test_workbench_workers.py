@@ -108,6 +108,7 @@ def test_a_script_finds_its_way_in_and_nothing_is_left_at_the_end(
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.long
 def test_what_a_killed_server_has_left_goes_when_the_next_one_starts(
     slip_serve: tuple[subprocess.Popen[str], Path], hidden_log: Path
 ) -> None:
