@@ -26,8 +26,8 @@ from pipeline.stages import SUMMARY_DIGITS, list_wanted, pick_row, round_number,
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store, StoreError, load_manifest
 
 _Packages = Mapping[str, tuple[str, ...]]
-_ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
-_CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("rosbags", "lz4"), SQLITE_BAG: ()}
+_ALWAYS = ("numpy", "scipy", "polars", "pyarrow", "rosbags")
+_CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("lz4",), SQLITE_BAG: ()}
 _COMPRESSION: _Packages = {"zstd": ("zstandard",), "lz4": ("pyarrow",)}
 _ENCODING: _Packages = {"protobuf": ("mcap", "mcap-protobuf-support")}
 

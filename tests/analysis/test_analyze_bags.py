@@ -53,7 +53,7 @@ def test_a_bag_gives_the_tables_and_findings_of_the_mcap(logs: tuple[Path, Path]
             other = other.filter(~pl.col("id").is_in(list(extra)))
         assert one.equals(other), name
     versions = bag.summary["provenance"]["versions"]
-    assert {"rosbags", "apsw"} <= versions.keys()
+    assert "rosbags" in versions
     assert "mcap" not in versions
     assert "no checksum" in json.dumps(bag.summary)
 

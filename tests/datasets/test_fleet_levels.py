@@ -222,7 +222,7 @@ def test_a_data_sheet_is_judged_over_the_runs_of_a_robot(tmp_path: Path) -> None
     fill_slippery(store, sibling=0.9)
     model = fit_results(store)
     assert len(model.runs["warthog"]) == 6
-    said = "slippery ground and no wrong wheel radius, by other runs of the same vehicle: ice_0, ice_1, ice_2"
+    said = "slippery ground and no wrong wheel radius, by other runs of the same vehicle: ice_0, ice_1 and ice_2"
     assert said in model.notes
     answer = compare_results(store, Question())
     assert set(answer.datasets["runs"]) == {3}
@@ -238,7 +238,7 @@ def test_siblings_that_do_not_contradict_it_leave_a_wrong_radius_wrong(
     fill_slippery(store, sibling=sibling)
     assert len(fit_results(store).runs["warthog"]) == 3
     notes = compare_results(store, Question()).notes
-    assert "left out, finding wheel_radius_wrong (3 runs): ice_0, ice_1, ice_2" in notes
+    assert "left out, finding wheel_radius_wrong (3 runs): ice_0, ice_1 and ice_2" in notes
 
 
 def test_simulated_runs_enter_no_fleet_and_no_trend_of_recordings(results: Store) -> None:
