@@ -218,7 +218,7 @@ def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
     slippery = _find_slippery(compared) if WRONG_RADIUS in set(grave["id"]) else []
     if slippery:
         reason = "slippery ground and no wrong wheel radius, by other runs of the same vehicle"
-        compared = replace(compared, notes=(*compared.notes, f"{reason}: {', '.join(slippery)}"))
+        compared = replace(compared, notes=(*compared.notes, f"{reason}: {name_first(slippery)}"))
     is_grip = (pl.col("id") == WRONG_RADIUS) & pl.col("run").is_in(slippery)
     for (finding,), rows in sorted(grave.filter(~is_grip).partition_by("id", as_dict=True).items()):
         compared = _leave_out(compared, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")

@@ -222,11 +222,11 @@ def test_a_data_sheet_is_judged_over_the_runs_of_a_robot(tmp_path: Path) -> None
     fill_slippery(store, sibling=0.9)
     model = fit_results(store)
     assert len(model.runs["warthog"]) == 6
-    said = "slippery ground and no wrong wheel radius, by other runs of the same vehicle: ice_0, ice_1 and ice_2"
-    assert said in model.notes
+    why = "slippery ground and no wrong wheel radius, by other runs of the same vehicle"
+    assert f"{why}: ice_0, ice_1 and ice_2" in model.notes
     answer = compare_results(store, Question())
     assert set(answer.datasets["runs"]) == {3}
-    assert said in answer.notes
+    assert f"{why}: ice_0, ice_1 and ice_2" in answer.notes
 
 
 @pytest.mark.parametrize("sibling", [0.6, 1.4, 0.0])
