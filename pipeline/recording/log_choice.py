@@ -45,6 +45,7 @@ from pipeline.sources import (
     DriveSource,
     PoseSource,
     Recognized,
+    Signal,
     Sources,
     Vehicle,
     VehicleSource,
@@ -262,12 +263,15 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
 
 def _list_named(configuration: Configuration) -> list[str]:
     """Topics that the configuration names."""
-    topics = (
-        configuration.pose.topic,
+    pose = configuration.pose
+    named = (
+        pose.topic,
+        configuration.imu.topic,
+        *filter(None, (pose.x, pose.y, pose.yaw)),
         *list_topics(configuration.command),
         *list_topics(configuration.wheels),
     )
-    return [topic for topic in topics if topic]
+    return [Signal.parse(text).topic for text in named if text]
 
 
 def _choose_readable(

@@ -334,7 +334,7 @@ def test_of_several_frames_that_move_the_one_of_the_namespace_is_the_vehicle(tmp
 @pytest.mark.parametrize(
     ("frames", "said"),
     [
-        ({"car": 1.0, "truck": 0.5}, r"several frames move \(car, truck\)"),
+        ({"car": 1.0, "truck": 0.5}, r"several frames move \(car and truck\)"),
         ({"dock": 0.0}, "no frame moves"),
     ],
 )

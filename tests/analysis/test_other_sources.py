@@ -113,7 +113,7 @@ def test_of_several_models_that_move_one_is_asked_for(
     with pytest.raises(SlipError) as caught:
         extract(log, "poses")
     assert caught.value.code == "no_body"
-    assert "husky_1, husky_2" in str(caught.value)
+    assert "husky_1 and husky_2" in str(caught.value)
     (tmp_path / "run.toml").write_text('[pose]\nname = "husky_2"\n', encoding="utf-8")
     assert extract(log, "poses").height > 500
 

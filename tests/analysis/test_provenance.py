@@ -15,7 +15,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import simulate_case
 
 ROOT = Path(__file__).parents[2]
-BASE = {"python", "slip-pipeline", "mcap", "numpy", "scipy", "polars", "pyarrow"}
+BASE = {"rosbags", "python", "slip-pipeline", "mcap", "numpy", "scipy", "polars", "pyarrow"}
 DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 
