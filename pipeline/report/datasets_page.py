@@ -136,12 +136,12 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
         store,
         "comparison.html",
         "Deployments compared",
-        [f"{main.height} datasets", f"{main['runs'].sum()} runs", answer.measure],
+        [format_count(main.height, "dataset"), f"{main['runs'].sum()} runs", answer.measure],
         lines=[f"{title}, {about}: {text}" for title, about, text in list_answer(answer)],
         pictures=[picture for view in answer.views if (picture := _draw_levels(answer, view))],
         tables=tables,
         notes=[*list_shown_notes(answer), *([ABOUT_UNIT] if published else [])],
-        runs=[f"{row['dataset']}: {row['keys']}" for row in main.iter_rows(named=True)],
+        runs=[key for keys in main["keys"] for key in keys.split()],
         figures=figures,
     )
 
