@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from simulated_platforms import scene_of
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -25,13 +26,16 @@ from pipeline.words.check import format_verdict
 
 TRACK = 1.8
 EFFECTS = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": TRACK}}
-KINDS = {"beside": {"vehicle": "husky"}, "alone": {"platform": "husky_a200"}}
-"""Wheel commands with the body command beside them, and a body command alone with encoders."""
+KINDS = ("alone", "beside")
+"""A body command alone with encoders, and wheel commands with the body command beside them."""
 
 
 def drive(folder: Path, kind: str, multiplier: float, seed: int) -> tuple[Vehicle, MotionRun]:
     """A drive of a robot whose controller has this multiplier, from the log on."""
-    scene = make_scenario(None, EFFECTS, seed=seed, duration_s=120.0, **KINDS[kind])  # type: ignore[arg-type]
+    if kind == "alone":
+        scene = scene_of("husky_a200", EFFECTS, seed=seed, duration_s=120.0)
+    else:
+        scene = make_scenario(None, EFFECTS, vehicle="husky", seed=seed, duration_s=120.0)
     scene = replace(scene, vehicle=replace(scene.vehicle, controller_track_multiplier=multiplier))
     log = folder / f"{kind}_{seed}.mcap"
     write_log(simulate_run(scene), log)
@@ -40,7 +44,7 @@ def drive(folder: Path, kind: str, multiplier: float, seed: int) -> tuple[Vehicl
     return vehicle, load_motion_run(made, vehicle)
 
 
-@pytest.fixture(scope="module", params=sorted(KINDS))
+@pytest.fixture(scope="module", params=KINDS)
 def sides(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Sides:
     """Before: the multiplier is 1; after: it makes up for the skidding."""
     folder = tmp_path_factory.mktemp("driven")

@@ -202,7 +202,7 @@ def test_simulated_runs_are_never_pooled_with_recordings(store: Store) -> None:
     mixed = ask(store)
     assert mixed.datasets["runs"].to_list() == [3, 3]
     assert all(row["keys"].split()[0].startswith("r") for row in mixed.datasets.iter_rows(named=True))
-    assert "left out, simulated, and never pooled with recordings (3 runs): s0, s1, s2" in mixed.notes
+    assert "left out, simulated, and never pooled with recordings (3 runs): s0, s1 and s2" in mixed.notes
 
 
 def test_features_can_be_given_away_and_put_together(store: Store) -> None:

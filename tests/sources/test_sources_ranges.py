@@ -35,7 +35,7 @@ def list_numbers(kind: msgspec.inspect.Type, keys: tuple[str, ...] = ()) -> Iter
             yield from list_numbers(one.item_type, (*keys, "[]"))
         elif isinstance(one, msgspec.inspect.DictType):
             names = getattr(one.key_type, "values", ["left"])
-            yield from list_numbers(one.value_type, (*keys, str(sorted(names)[-1])))
+            yield from list_numbers(one.value_type, (*keys, str(max(names))))
 
 
 CONFIGURED = list(list_numbers(msgspec.inspect.type_info(Configuration)))
