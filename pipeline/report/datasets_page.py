@@ -43,12 +43,9 @@ _MOST_FIGURES = 40
 """Series of a page: those with a step come first."""
 _SHOWN = (
     "dataset", "runs", "samples", "distance", "duration", "median_modulus", "low", "high", "interval",
-    "equal_modulus",
-    "equal_low", "equal_high", "median_window_norm", "published_norm", "transitory_median_modulus",
-    "steady_median_modulus", "drivetrain_mean_square", "ground_mean_square", "height_rate",
-    "largest_kinetic_energy",
-    *(measure.column for measure in MEASURES.values() if measure.column != "median_modulus"),
+    "equal_modulus", "equal_low", "equal_high", "median_window_norm", "published_norm",
 )  # fmt: skip
+"""Columns of datasets on the page; the files beside it have all."""
 _PAIRS = (
     "a", "b", "ratio", "ratio_low", "ratio_high", "shift", "low", "high", "cliffs_delta", "size",
     "p_adjusted", "p", "spread", "freedom", "overlap", "method", "note",

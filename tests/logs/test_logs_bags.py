@@ -223,7 +223,7 @@ def test_a_database_of_something_else_is_no_recording(tmp_path: Path) -> None:
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE notes(text TEXT)")
     database.close()
-    with pytest.raises(LogError, match="missing tables") as caught:
+    with pytest.raises(LogError, match="tables are missing") as caught:
         open_log(path)
     assert caught.value.code == "log_unreadable"
 
@@ -312,5 +312,5 @@ def test_a_view_in_place_of_a_table_is_not_asked(tmp_path: Path, table: str) -> 
     if table == "message_definitions":
         assert len(read_topics(file, [Wanted("/joints", ())]).of("/joints")[0]) > 0
         return
-    with pytest.raises(LogError, match="missing tables"):
+    with pytest.raises(LogError, match="tables are missing"):
         open_log(file)
