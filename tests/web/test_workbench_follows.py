@@ -1,6 +1,7 @@
 """Everything that is shown is of the model that stands there: map, commands, where it fails, what to add."""
 
 import json
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,8 +33,9 @@ def write_diagnosis(workbench: Workbench, told: dict[str, object]) -> None:
     home = workbench.results / "runs/field/hidden"
     manifest = json.loads((home / "manifest.json").read_text())
     del manifest["checksum"]
-    (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(told))
-    manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
+    content = json.dumps(told).encode()
+    (home / manifest["folder"] / "diagnosis.json").write_bytes(content)
+    manifest["files"]["diagnosis.json"] = {"bytes": len(content), "sha256": sha256(content).hexdigest()}
     (home / "manifest.json").write_bytes(encode_checked(manifest))
 
 
