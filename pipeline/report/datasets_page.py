@@ -11,7 +11,6 @@ from pipeline.datasets import (
     ABOUT_UNIT,
     AS_PUBLISHED,
     EQUAL_DRIVING,
-    MEASURES,
     QUANTITIES,
     THIS_RUN,
     Answer,
