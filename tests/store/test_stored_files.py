@@ -21,7 +21,7 @@ VERBS = {
     "diagnosis.json": [
         f"diagnose {RUN}",
         f"diagnose {RUN} --all",
-        f"results explain {RUN} effective_track.k",
+        f"results status {RUN}",
         f"export {RUN} --to foxglove-layout --file x.json",
     ],
 }
