@@ -72,7 +72,7 @@ def python_command(*words: str) -> list[str]:
     """Command line of this interpreter, by its absolute path, without the current folder in its import path.
 
     Args:
-        words: arguments, such as ``-m pipeline.live.receiver``.
+        words: arguments, such as ``-m pipeline analyze``.
     """
     return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
 
