@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import format_share
-from pipeline.estimation.candidates import Screen
 from pipeline.estimation.decision import LEAST_T, measure_t
 from pipeline.estimation.errors import Errors
 from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
+from pipeline.estimation.matrix import Matrix
 from pipeline.estimation.model_fit import Fitted
 from pipeline.models import Model, explain_idle
 from pipeline.results import CHANCE, format_rises, list_rises
@@ -95,10 +95,12 @@ def list_promising(data: EstimationData, fitted: Fitted) -> list[Candidate]:
     by_id = {candidate.id: candidate for candidate in candidates}
     promising = []
     for path, fit in zip(data.paths, fitted.fits, strict=True):
-        effects = [candidate for candidate in candidates if candidate().acts_in(fitted.model.ids)]
+        ids = fitted.model.ids
+        effects = [one for one in candidates if one.id not in ids and one().acts_in(ids)]
         mine = [candidate for candidate in effects if path.owns(candidate())]
-        paying = [one for one in Screen(fit, mine, data.largest).list_singles() if one.net > 0.0]
-        promising += [by_id[one.names[0]] for one in paying[:MOST_FITTED]]
+        matrix = Matrix(fit, mine, data.largest)
+        paying = [one for one in matrix.list_singles() if matrix.promise(one) < 0.0]
+        promising += [by_id[matrix.trials[one.added[0]].effect.id] for one in paying[:MOST_FITTED]]
     return promising
 
 

@@ -39,11 +39,7 @@ def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]
         effect = outcome.final.state.find(name)
         if effect is None:
             continue
-        rivals = {
-            one.judged.added[0]: one.judged.fit
-            for one in outcome.rivals
-            if one.effect == name and len(one.judged.added) == 1
-        }
+        rivals = {one.other: one.fit for one in outcome.rivals if one.effect == name}
         largest = search.conditions.largest
         same = effect.same_in_one_motion if largest.is_one_motion else ()
         # Whichever fits the transients better: what a drive does at another speed is not known.
@@ -171,7 +167,7 @@ def find_unobservable(
     Returns:
         These, and the detection thresholds of the other effects that are linear in one parameter.
     """
-    fit, path = outcome.screen.saturated, search.path
+    fit, path = outcome.matrix.fit, search.path
     own = fit.white.columns
     basis = np.linalg.qr(own / (np.linalg.norm(own, axis=0) + 1e-12))[0] if own.size else own
     unit = path.unit[fit.white.rows]

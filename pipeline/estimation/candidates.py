@@ -1,44 +1,41 @@
-"""Candidates: effects that a model lacks, and what one or two of them would explain, to first order."""
+"""Candidates: effects that a model may lack, at all their starts, and what each changes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import combinations, pairwise
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pipeline.estimation.fit import RIDGE, invert, whiten_columns
+from pipeline.estimation.fit import whiten_columns
 from pipeline.estimation.model_state import stack_columns
+from pipeline.estimation.terms import is_term
 from pipeline.models import Effect, Parameter, Search
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.core import Flags, Floats, Ints
+    from pipeline.core import Floats
     from pipeline.estimation.fit import PathFit
     from pipeline.estimation.model_state import ModelState
     from pipeline.models import Largest
 
 PRICE = 25.0
 """Fall of chi-square that each number of a model must bring: five standard errors."""
+_UNUSUAL = 8.0
+"""The same for an effect that no controller has a parameter for: before any data it is e^4 times less common
+than a wrong track, a lag or a limit."""
+SHAPES = 8640
+"""Shapes of formulas that a term is the best of, for which it pays: for those of the terms alone it displaces
+effects of the catalogue that are right (a lateral skid, drawn sets, seed 44)."""
 _NO_TRACE = 1e-6
 """Size of an innovation below which a number has no influence."""
 _FAINT = 0.3
 """Size of what a number of typical size changes [standard errors] below which it is not fitted: noise that
 hides an effect is learned from residuals that hold it."""
-_INDEPENDENT = 0.02
-"""Share of a column that the model's own columns, or those of its partner, must leave."""
 _LEAST_SHARE = 0.05
 """Least share of a start's effect that the data must ask for."""
-_SATURATED = 1e-3
-"""Regularization of the fit of all candidates at once, columns of unit size."""
-_PASSES = 2
-"""Times that the noise is learned from what no candidate explains."""
-_PAIRED = 16
-"""Candidates that are combined in pairs."""
 
 
 class Candidate(Protocol):
@@ -102,6 +99,17 @@ class Trial:
         free = (name for name, value in self.effect.values.items() if math.isfinite(value))
         return len(set(free) - self.effect.fixed)
 
+    @property
+    def price(self) -> float:
+        """Fall of chi-square that it must bring."""
+        return PRICE * self.numbers + find_rarity(self.effect)
+
+    @property
+    def is_one_number(self) -> bool:
+        """Whether it is a secant of one number, a share of which may be what the data ask for."""
+        acting = self.effect.list_acting()
+        return not self.names and not self.own and [p.search for p in acting] == [Search.STARTS]
+
     def add_to(self, state: ModelState, step: Sequence[float]) -> ModelState:
         """The state with the effect, its linear numbers moved by a step of the columns."""
         if self.own:
@@ -133,171 +141,17 @@ class Trial:
         return True
 
 
-@dataclass(frozen=True)
-class Extension:
-    """One or two candidates that could be added to a model.
-
-    Attributes:
-        trials: a start of each.
-        step: of their columns, in the order of the trials.
-        gain: expected fall of chi-square.
-    """
-
-    trials: tuple[Trial, ...]
-    step: tuple[float, ...]
-    gain: float
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Ids of the effects."""
-        return tuple(trial.effect.id for trial in self.trials)
-
-    @property
-    def net(self) -> float:
-        """Expected gain less the price of its numbers."""
-        return self.gain - PRICE * sum(trial.numbers for trial in self.trials)
-
-    def _steps(self) -> Iterator[tuple[Trial, tuple[float, ...]]]:
-        begin = 0
-        for trial in self.trials:
-            end = begin + trial.columns.shape[2]
-            yield trial, self.step[begin:end]
-            begin = end
-
-    @property
-    def is_possible(self) -> bool:
-        """Whether each of the effects is, see `Trial.is_possible`."""
-        return all(trial.is_possible(step) for trial, step in self._steps())
-
-    def add_to(self, state: ModelState) -> ModelState:
-        """The state with the effects at their expected values."""
-        for trial, step in self._steps():
-            state = trial.add_to(state, step)
-        return state
+def find_rarity(effect: Effect) -> float:
+    """What an effect must bring for being unusual, or one of many shapes."""
+    if is_term(effect.id):
+        return _UNUSUAL + 2.0 * math.log(SHAPES)
+    return 0.0 if any(p.quantities for p in effect.parameters) else _UNUSUAL
 
 
-class Screen:
-    """What candidates would explain of a fitted model's residuals.
-
-    Args:
-        fit: the model.
-        candidates: effects that could be added.
-        largest: reference of relative starts.
-    """
-
-    def __init__(self, fit: PathFit, candidates: Sequence[Candidate], largest: Largest) -> None:
-        self.fit = fit
-        trials = (
-            trial
-            for candidate in candidates
-            if candidate.id not in fit.ids
-            for trial in list_trials(fit, candidate, largest)
-        )
-        self.trials = tuple(filter(None, (_leave_out_silent(fit, trial) for trial in trials)))
-        columns = [fit.columns, *(trial.columns for trial in self.trials)]
-        ends = np.cumsum([column.shape[2] for column in columns]).tolist()
-        self._places = [np.arange(begin, end) for begin, end in pairwise(ends)]
-        self._own = ends[0]
-        self._columns = np.concatenate(columns, axis=2)
-
-    @cached_property
-    def saturated(self) -> PathFit:
-        """The fit with the noise of what no candidate explains.
-
-        The noise of present residuals takes a slow hidden effect for a slow disturbance, and hides it.
-        """
-        fit, path = self.fit, self.fit.path
-        chosen = [*range(self._own), *self._list_best_columns(fit)]
-        for _ in range(_PASSES if len(chosen) > self._own else 0):
-            white = whiten_columns(fit, self._columns[:, :, chosen])
-            size = np.sqrt(np.einsum("ij,ij->j", white, white)) + 1e-12
-            normal = (white / size).T @ (white / size) + _SATURATED * np.eye(size.size)
-            step = np.linalg.solve(normal, (white / size).T @ fit.white.residual) / size
-            rest = fit.residual - self._columns[:, :, chosen] @ step
-            fit = replace(fit, noise=path.learn(rest, fit.noise))
-        return fit
-
-    def _list_best_columns(self, fit: PathFit) -> list[int]:
-        """Columns of the best start of each candidate."""
-        normal, pull, _ = _project(fit, self._columns, self._own)
-        best: dict[str, tuple[float, Ints]] = {}
-        for trial, places in zip(self.trials, self._places, strict=True):
-            at = places - self._own
-            step = invert(normal[np.ix_(at, at)]) @ pull[at]
-            gain = float(step @ pull[at])
-            if trial.effect.id not in best or gain > best[trial.effect.id][0]:
-                best[trial.effect.id] = gain, places
-        return [position for _, places in best.values() for position in places]
-
-    @cached_property
-    def _projected(self) -> tuple[Floats, Floats, Floats, Flags]:
-        """Normal matrix and pull of the candidates' columns of unit size beside the model.
-
-        Returns:
-            Both, by the standard deviation of the innovations, the columns' sizes, and whether the model
-            leaves enough of each.
-        """
-        fit = self.saturated
-        normal, pull, alone = _project(fit, self._columns, self._own)
-        remaining = np.diag(normal)
-        size = np.sqrt(np.maximum(remaining, 1e-24))
-        deviation = math.sqrt(max(float(np.mean(fit.white.residual**2)), 1e-6))
-        scaled = normal / np.outer(size, size) + RIDGE * np.eye(size.size)
-        return scaled, pull / (size * deviation), size / deviation, remaining >= _INDEPENDENT * alone
-
-    @cached_property
-    def _alone(self) -> list[Extension | None]:
-        """Each trial as an extension, possible or not; None where it is not independent."""
-        return [self._measure((index,)) for index in range(len(self.trials))]
-
-    def list_singles(self) -> list[Extension]:
-        """The best start of each candidate that is possible, by gain less price."""
-        best: dict[str, Extension] = {}
-        for extension in self.list_starts():
-            best.setdefault(extension.names[0], extension)
-        return list(best.values())
-
-    def list_starts(self) -> list[Extension]:
-        """Every start of every candidate that is possible, by gain less price."""
-        possible = [one for one in self._alone if one is not None and one.is_possible]
-        return sorted(possible, key=lambda one: -one.net)
-
-    def list_pairs(self) -> list[Extension]:
-        """Pairs that explain more than each of the two alone pays for, by gain less price."""
-        # Beside another effect a value may be possible that is not alone.
-        nets = {index: one.net for index, one in enumerate(self._alone) if one is not None}
-        best = {self.trials[index].effect.id: index for index in sorted(nets, key=nets.__getitem__)}
-        leading = sorted(best.values(), key=nets.__getitem__, reverse=True)[:_PAIRED]
-        pairs = (self._measure(pair) for pair in combinations(leading, 2))
-        paying = [pair for pair in pairs if pair is not None and pair.is_possible and pair.net > 0.0]
-        return sorted(paying, key=lambda one: -one.net)
-
-    def _measure(self, indices: tuple[int, ...]) -> Extension | None:
-        """Some trials as an extension, possible or not; None where it is not independent."""
-        normal, pull, size, is_left = self._projected
-        at = np.concatenate([self._places[index] for index in indices]) - self._own
-        if not is_left[at].all():
-            return None
-        inverse = np.linalg.inv(normal[at[:, None], at])
-        # What the other columns leave of each, as a share.
-        if len(indices) > 1 and (1.0 / np.diag(inverse)).min() < _INDEPENDENT:
-            return None
-        step = inverse @ pull[at]
-        trials = tuple(self.trials[index] for index in indices)
-        return Extension(trials, tuple((step / size[at]).tolist()), float(step @ pull[at]))
-
-
-def _project(fit: PathFit, columns: Floats, own: int) -> tuple[Floats, Floats, Floats]:
-    """Normal matrix and pull of candidates' columns, those of the model projected out, and squared sizes."""
-    white = whiten_columns(fit, columns)
-    mine, rest = white[:, :own], white[:, own:]
-    sizes: Floats = np.einsum("ij,ij->j", rest, rest)
-    residual = fit.white.residual
-    if own:
-        basis = np.linalg.qr(mine / (np.linalg.norm(mine, axis=0) + 1e-12))[0]
-        rest = rest - basis @ (basis.T @ rest)
-        residual = residual - basis @ (basis.T @ residual)
-    return rest.T @ rest, rest.T @ residual, sizes
+def list_all_trials(fit: PathFit, candidates: Sequence[Candidate], largest: Largest) -> tuple[Trial, ...]:
+    """All starts of all candidates that change anything, each with the columns of its numbers."""
+    trials = (trial for candidate in candidates for trial in list_trials(fit, candidate, largest))
+    return tuple(filter(None, (_leave_out_silent(fit, trial) for trial in trials)))
 
 
 def _leave_out_silent(fit: PathFit, trial: Trial) -> Trial | None:

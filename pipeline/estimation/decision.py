@@ -1,35 +1,37 @@
 """The one decision: which effects a model lacks.
 
-A search adds the effects that the data ask for until none is accepted; what `judge` decides is not changed
-by anything after it. Models are compared by their likelihood less `PRICE` for each number. Of models within
-`EQUAL` of the best the one with fewest numbers is taken, and the others are reported as undecided.
+At a model, `Matrix` says what every set of effects near it promises. The best sets are looked at with one
+evaluation each, the best of these fitted, and the matrix made anew there, until nothing is cheaper. A model
+costs minus twice its log-likelihood and the price of its numbers; special cases within `EQUAL` are taken in
+the place of an effect. What stays has a name where `judge` accepts it, and nothing after it changes that.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from itertools import combinations
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import stdtr
 
 from pipeline.core import NORMAL_95, Budget, format_share
-from pipeline.estimation.candidates import PRICE, Candidate, Screen, list_starts
-from pipeline.estimation.fit import PathFit, approach, approach_each, fit_path
+from pipeline.estimation.candidates import PRICE, Candidate, find_rarity, list_starts
+from pipeline.estimation.fit import PathFit, begin_fit, fit_path, fit_roughly, invert, measure_cost, whiten
 from pipeline.estimation.intervals import find_covariance
+from pipeline.estimation.matrix import Change, Matrix
+from pipeline.estimation.model_state import combine_columns, pick_columns
 from pipeline.estimation.noise import huber_cost
-from pipeline.estimation.path_residuals import HORIZONS_S
-from pipeline.estimation.plausibility import is_nameable, is_too_small, list_implausible
+from pipeline.estimation.plausibility import is_nameable, is_too_small
+from pipeline.models import Search as HowSearched
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterator
 
-    from pipeline.core import Floats, Ints
+    from pipeline.core import Floats
     from pipeline.estimation.model_state import ModelState
     from pipeline.estimation.noise import Noise
-    from pipeline.estimation.path_residuals import HorizonError, PathResiduals
+    from pipeline.estimation.path_residuals import PathResiduals
     from pipeline.models import Conditions, Effect
 
 LEAST_T = 5.0
@@ -38,68 +40,74 @@ effect stays below."""
 STABLE_T = 0.5 * LEAST_T
 """The same without the ten seconds that contribute most: one event is not enough."""
 EQUAL = 12.0
-"""Difference of two models' scores below which the data do not decide between them."""
+"""Difference of two models' costs below which the data do not decide between them."""
+SHOWN = 0.1
+"""Share by which an effect is expected to lower an error over one of `HORIZONS_S`."""
 LEAST_WAY_SHARE = 0.005
 """Share of the distance driven that an effect must move: half a 5 cm cell after 5 m."""
 LEAST_TURN_RAD = 0.0025
 """Heading change that it must make otherwise [rad]: a quarter of such a cell beside the path."""
 _FELT_S = (2.0, 10.0)
 """Horizons over which it may: a track that is off by 1 % is felt after a turn, not in two seconds of it."""
-_UNUSUAL = 8.0
-"""Cost of an effect that no controller has a parameter for: before any data it is e^4 times less common than
-a wrong track, a lag or a limit."""
-SHOWN = 0.1
-"""Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
-_RISE = SHOWN / 2.0
-"""Share by which it may raise one: a smaller rise is nothing that anybody would notice."""
-_RISEN = 0.02
-"""Probability below which a rise of any of the held-out errors by `_RISE` is no chance. Where few
-blocks tell nothing of chance, none may rise by more than the largest fall."""
-_ALIKE = 0.3
-"""Correlation of two numbers from which on their effects may stand for one common cause."""
-_MOST_EFFECTS = 8
-"""Most effects that a search adds on one path: a longer list explains nothing."""
-_SINGLES, _PAIRS = 4, 3
-"""Extensions by one effect and by two that are fitted in each round."""
-_NEAR = 0.2
-"""Share of what the best one explains that it may lack after them to be fitted to the end."""
-_SURE = 0.95
-"""Share of resampled recordings in which an effect must be better than a special case of it."""
-_TRIED = 2
-"""Extensions that are begun for each place."""
+_SURE = 0.9
+"""Share of resampled recordings in which an effect pays its price."""
 _DRAWS = 400
-"""Resamples of blocks: a frequency near 0.95 has a standard error of 0.01."""
+"""Resamples of blocks: a frequency near 0.9 has a standard error of 0.015."""
+_OFTEN = 0.1
+"""Share of them in which others in its place must cost less, for the data not to decide between them."""
+_PROMISING = 0.5
+"""Share of what an effect brings that others in its place may promise less, to be fitted."""
+_RIVALS = 3
+"""Others that are fitted in the place of each effect."""
+_ROUNDS = 14
+"""Most times that a model is improved."""
+_LOOKED, _LOOKS = 12, 2
+"""Sets that are looked at together, and how often where none of them is better."""
+_FITTED, _NEAR = 3, 0.3
+"""Most of them that are fitted, and the share of what the best one brings at first sight that others must."""
+_STEPS, _FEW_STEPS, _HARD_STEPS = 8, 4, 6
+"""Steps of a fit with the noise as it is: of a set, of the model before, of a whole in its parts' place."""
+_ANOTHER_STEPS = 5
+"""The same from another start of an effect."""
+_FALL = 1.0
+"""Fall of the cost that is worth a move."""
+_WHOLE_FALL = 100.0
+"""Fall of the cost by which an effect of many numbers must beat its special cases to take their place."""
+_WHOLE_NEAR, _WHOLE_SHARE = 300.0, 0.2
+"""How far behind them, or what share of what they explain, it may be after some steps to be fitted."""
+_FEWEST_STARTS = 2
+"""Numbers without linear influence from which on an effect has several valleys."""
+_BANS = 5
+"""Most times that the search goes on without effects whose values are not possible."""
+_BETTER = 2
+"""Most times that it begins again from what others in the place of one effect make."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """An extension of a model, fitted and judged.
+    """An effect of a model, judged against the model without it.
 
     Attributes:
-        base: the smaller model.
-        fit: the larger model.
-        added: ids of its new effects.
-        refusal: why it is not accepted; empty where it is.
-        gain: share of the smaller model's held-out cost that it removes.
-        frequency: share of resampled recordings in which it removes some of it.
+        base: the model without it, its other numbers adapted linearly.
+        fit: the model.
+        effect: its id.
+        refusal: why it has no name; empty where it has one.
+        is_proven: whether it stays in the model: without a name, where only nobody would feel it.
+        t: standard errors by which its numbers are away from none.
+        frequency: share of resampled recordings in which it pays its price.
+        gain: share of the held-out cost of the model without it that it removes.
         evidence: fall of the cost in each stretch of ten seconds, shape (b,).
-        falls: relative fall of each held-out error, position and heading over each of `HORIZONS_S`, shape
-            (4, 2), NaN where nothing is predicted so far.
     """
 
     base: PathFit
     fit: PathFit
-    added: tuple[str, ...]
+    effect: str
     refusal: str
-    gain: float = math.nan
-    frequency: float = math.nan
-    evidence: Floats = field(default_factory=lambda: np.zeros(0))
-    falls: Floats = field(default_factory=lambda: np.full((len(HORIZONS_S), 2), math.nan))
-
-    @property
-    def cost(self) -> float:
-        """Score with the price of its numbers: smaller is better."""
-        return find_cost(self.fit)
+    is_proven: bool
+    t: float
+    frequency: float
+    gain: float
+    evidence: Floats = field(repr=False)
 
 
 def find_cost(fit: PathFit) -> float:
@@ -109,22 +117,23 @@ def find_cost(fit: PathFit) -> float:
 
 def _find_price(state: ModelState, numbers: int) -> float:
     """What a model must bring for its numbers and unusual effects."""
-    unusual = sum(not any(p.quantities for p in effect.parameters) for effect in state.effects)
-    return PRICE * numbers + _UNUSUAL * unusual
+    return PRICE * numbers + sum(map(find_rarity, state.effects))
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A model with other effects in the place of one that was chosen.
+    """Another effect in the place of one that was chosen.
 
     Attributes:
         effect: id of the chosen effect.
-        judged: the other model, judged against the one without that effect.
+        other: id of the other.
+        fit: the model with it.
         behind: its cost less that of the chosen model.
     """
 
     effect: str
-    judged: Judged
+    other: str
+    fit: PathFit
     behind: float
 
 
@@ -134,11 +143,11 @@ class SearchResult:
 
     Attributes:
         start: the model to start from, fitted.
-        final: the model that no extension improves, fitted; effects too small for a name are in it, too.
+        final: the cheapest model, fitted; effects too small for a name are in it, too.
         new: ids of the effects that are named.
-        judged: how each of its effects was judged against the model without it, by id.
-        rivals: models that the data do not separate from it.
-        screen: what candidates explain of its residuals.
+        judged: how each effect was judged, by id, but for given ones and those too small for a name.
+        rivals: effects that the data do not separate from one of them.
+        matrix: of the final model.
     """
 
     start: PathFit
@@ -146,7 +155,7 @@ class SearchResult:
     new: tuple[str, ...]
     judged: dict[str, Judged]
     rivals: tuple[Rival, ...]
-    screen: Screen
+    matrix: Matrix
 
 
 @dataclass
@@ -159,7 +168,7 @@ class Search:
         conditions: what the runs can show.
         given: ids of effects that stay.
         budget: of CPU time.
-        shapes: of how many shapes each candidate is the best one: the evidence for it is reduced accordingly.
+        least_t: standard errors that each effect must be from none.
     """
 
     path: PathResiduals
@@ -167,364 +176,321 @@ class Search:
     conditions: Conditions
     given: frozenset[str] = frozenset()
     budget: Budget = field(default_factory=Budget)
-    shapes: int = 1
-    _fits: dict[tuple[object, ...], PathFit] = field(default_factory=dict)
-    _rivals: dict[tuple[object, ...], list[Judged]] = field(default_factory=dict, init=False)
+    least_t: float = LEAST_T
+    _tried: set[object] = field(default_factory=set, init=False)
+    _banned: set[tuple[str, ...]] = field(default_factory=set, init=False)
 
     def run(self, start: ModelState) -> SearchResult:
         """Search from a model."""
-        first, asked = self.fit(start), self.given
-        extended = self._extend_all(first)
-        result, other = self._conclude(first, extended)
-        # What is a part of the extended model was passed by on the way to it.
-        while other is not None and not set(other.ids) <= set(extended.ids):
-            # Models are compared with all that improves them, what is not accepted in the end included.
-            before, given = find_cost(extended), self.given
-            self.given = asked | {one.id for one in self._list_small(other)}
-            extended = self._extend_all(other)
-            if self.budget.is_spent() or not find_cost(extended) < before - EQUAL:
-                self.given = given
+        first = fit_path(self.path, start)
+        final, judged = self.name_all(self.search_possible(first))
+        matrix = self.make_matrix(final)
+        rivals = list[Rival]()
+        for _ in range(_BETTER):
+            rivals = list(self._list_rivals(final, matrix, judged))
+            better = min(rivals, key=lambda one: one.behind, default=None)
+            if better is None or better.behind > -EQUAL or self.budget.is_spent():
                 break
-            result, other = self._conclude(first, extended)
-        return result
+            final, judged = self.name_all(self.search_possible(better.fit))
+            matrix = self.make_matrix(final)
+        named = tuple(name for name, one in judged.items() if not one.refusal)
+        return SearchResult(first, final, named, judged, tuple(rivals), matrix)
 
-    def _conclude(self, first: PathFit, extended: PathFit) -> tuple[SearchResult, PathFit | None]:
-        """The result with a model's accepted effects, and a better model with others in the place of one."""
-        current, judged = self._restore(*self.refuse(extended), extended)
-        rivals, better = list[Rival](), list[Judged]()
-        for name, one in judged.items():
-            for other in self.list_rivals(current, one.base, [name]):
-                behind = other.cost - find_cost(current)
-                is_new = behind < EQUAL and not set(other.added) & set(current.ids)
-                # An error of the data sheet, too small for a name, may be as good an explanation as a name.
-                if is_new and self._is_fine(other) and self.replaces(current, other):
-                    rivals.append(Rival(name, other, behind))
-                if self._is_better(other, current):
-                    better.append(other)
-        result = SearchResult(first, current, tuple(judged), judged, tuple(rivals), self.screen(current))
-        chosen = _choose(better)
-        return result, None if chosen is None else self.prune(chosen.fit)
+    def make_matrix(self, fit: PathFit) -> Matrix:
+        """What sets of effects near a model would explain; special cases of its effects are in it already."""
+        known = {*fit.ids}.union(*(effect.contains for effect in fit.state.effects))
+        acting = [one for one in self.candidates if one.id not in known and one().acts_in(fit.ids)]
+        return Matrix(fit, acting, self.conditions.largest)
 
-    def _extend_all(self, current: PathFit) -> PathFit:
-        """The model extended until nothing is accepted."""
-        while not self.budget.is_spent():
-            self.budget.report(self.path.title, current.ids)
-            known = current.ids
-            fine = [one for one in self._extend(current) if self._is_fine(one)]
-            small = _choose([one for one in fine if self._list_small(one.fit, known)])
-            chosen = _choose([one for one in fine if not self._list_small(one.fit, known)])
-            if (
-                small is not None
-                and small.cost < find_cost(current if chosen is None else chosen.fit) - EQUAL
-            ):
-                # An effect that is too small for a name, as sampling makes: others would only imitate it.
-                self.given |= {one.id for one in self._list_small(small.fit, known)}
-                current = small.fit
-                continue
-            better = None if chosen is None else self.prune(chosen.fit)
-            if better is None or not find_cost(better) < find_cost(current):
-                # What an extension makes superfluous may have been worth more than it.
-                better = self._exchange(current)
-            if better is None or not find_cost(better) < find_cost(current):
+    def search_possible(self, first: PathFit) -> PathFit:
+        """The cheapest model whose effects all have possible values."""
+        current = self._climb(first)
+        for _ in range(_BANS):
+            wrong = {one.id for one in current.state.effects if self._is_impossible(current, one)}
+            if not wrong:
                 break
-            self.given |= {one.id for one in self._list_small(better, current.ids)}
-            current = better
+            # What cannot be would keep what is there from the set.
+            self.candidates = tuple(one for one in self.candidates if one.id not in wrong)
+            current = self._climb(fit_path(self.path, current.state.drop(wrong), noise=current.noise))
         return current
 
-    def _exchange(self, current: PathFit) -> PathFit | None:
-        """A better model with others in the place of one effect, or with an effect for its special cases."""
-        companions = {name for effect in current.state.effects for name in effect.companions}
-        for candidate in self.candidates:
-            whole = self._try_whole(current, candidate)
-            if whole is None and candidate.id in companions:
-                whole = self._try_beside(current, candidate)
-            if whole is not None:
-                return whole
-        for name in current.ids:
-            if name in self.given or self.budget.is_spent():
-                continue
-            others = self.list_rivals(current, self._drop(current, [name]), [name])
-            best = _choose([one for one in others if self._is_better(one, current)])
-            if best is not None:
-                return self.prune(best.fit)
-        return None
+    def _is_impossible(self, fit: PathFit, effect: Effect) -> bool:
+        acting = _list_acting(fit, effect)
+        is_possible = any(is_nameable(one, self.conditions) for one in acting) or self._is_small(fit, effect)
+        return effect.id not in self.given and not is_possible
 
-    def _is_better(self, other: Judged, current: PathFit) -> bool:
-        """Whether a model is accepted, more likely than another one, and raises no error beyond chance."""
-        if other.refusal or other.cost >= find_cost(current) - EQUAL:
-            return False
-        _, rise, _ = _compare_horizons(current.horizon_errors, other.fit.horizon_errors)
-        return rise <= _RISE
+    def _is_small(self, fit: PathFit, effect: Effect) -> bool:
+        """Whether only its size keeps an effect from a name: it stays, as others would only imitate it."""
+        return all(is_too_small(one, self.conditions) for one in _list_acting(fit, effect))
 
-    @property
-    def _least_t(self) -> float:
-        return math.sqrt(LEAST_T**2 + 2.0 * math.log(self.shapes))
+    def _climb(self, current: PathFit) -> PathFit:
+        """The model improved until nothing is cheaper."""
+        restarted = set[tuple[str, ...]]()
+        for _ in range(_ROUNDS):
+            if self.budget.is_spent():
+                break
+            self.budget.report(self.path.title, current.ids)
+            better = self._improve(current)
+            if better is None and current.ids not in restarted:
+                restarted.add(current.ids)
+                better = self._start_again(current) or self._try_wholes(current)
+            if better is None:
+                break
+            current = better
+        return self._simplify(fit_path(self.path, current.state, noise=current.noise))
 
-    def _judge(self, base: PathFit, fit: PathFit, *, is_final: bool) -> Judged:
-        small = self._list_small(fit, base.ids)
-        named = set(fit.ids) - set(base.ids) - {one.id for one in small}
-        if small and named:
-            # What is too small for a name has none, and keeps what comes with it from none. It stays as it
-            # is beside that: fitted without, it would spread the trace of what shows but once.
-            held = [one.fix(*one.values) for one in small]
-            base = self.fit(fit.state.drop(named).add(*held))
-        return judge(base, fit, self.conditions, self._least_t, is_final=is_final)
-
-    def _list_small(self, fit: PathFit, known: Collection[str] = ()) -> list[Effect]:
-        """Effects of a model, but for the known ones, that only their size keeps from a name."""
-        new = (effect for effect in fit.state.effects if effect.id not in known)
-        return [
-            one for one in new if all(is_too_small(each, self.conditions) for each in _list_acting(fit, one))
-        ]
-
-    def _is_fine(self, judged: Judged) -> bool:
-        """Whether a model is accepted, or refused for the size of its new effects alone."""
-        small = self._list_small(judged.fit, judged.base.ids)
-        return not judged.refusal or (bool(small) and len(small) == len(judged.added))
-
-    def fit(self, state: ModelState, most: float = math.inf, noise: Noise | None = None) -> PathFit:
-        """The fit from a state; made once, unless it ended early as it cannot cost less than `most`."""
-        key = _make_key(state)
-        if key in self._fits:
-            return self._fits[key]
-        target = most - _find_price(state, len(self.path.list_free(state)))
-        fit = fit_path(self.path, state, noise=noise, target=target)
-        if find_cost(fit) < most:
-            self._fits[key] = fit
-        return fit
-
-    def _drop(self, fit: PathFit, names: Collection[str]) -> PathFit:
-        return self.fit(fit.state.drop(names))
-
-    def screen(self, fit: PathFit, without: Collection[str] = ()) -> Screen:
-        """What could be added to a model; special cases of its effects are in it already."""
-        known = set(without).union(*({*effect.contains} for effect in fit.state.effects))
-        acting = [one for one in self.candidates if one.id not in known and one().acts_in(fit.ids)]
-        return Screen(fit, acting, self.conditions.largest)
-
-    def _extend(self, current: PathFit) -> list[Judged]:
-        """Extensions of a model, accepted or refused."""
-        if len(current.ids) - len(self.given) >= _MOST_EFFECTS:
-            return []
-        return self._judge_extensions(current, self.screen(current), _SINGLES, _PAIRS)
-
-    def _judge_extensions(
-        self,
-        base: PathFit,
-        screen: Screen,
-        singles: int,
-        pairs: int,
-        wanted: float = 0.0,
-        reached: float = math.inf,
-    ) -> list[Judged]:
-        """The most promising extensions of a model, fitted and judged.
-
-        Args:
-            base: the model.
-            screen: what they promise.
-            singles: most that are by one effect and better than none.
-            pairs: most that are by two.
-            wanted: expected gain, less price, that they must exceed.
-            reached: cost of the model that they would replace.
-        """
-        judged, before, rough = dict[tuple[str, ...], Judged](), find_cost(base), list[PathFit]()
-        most, reached = min(before, reached + EQUAL), min(before, reached)
-        for extensions, places in ((screen.list_singles(), singles), (screen.list_pairs(), pairs)):
-            # Some steps show which may come near the best, and which keep nothing of what they promise.
-            for extension in extensions[: _TRIED * places]:
-                if not places or not extension.net > wanted:
+    def _improve(self, current: PathFit) -> PathFit | None:
+        """The cheapest of the sets that promise most; None where none is cheaper."""
+        matrix = self.make_matrix(current)
+        # All are compared under one noise, and must be cheaper under their own, too.
+        noise = matrix.noise
+        base = _fit_under(self.path, current.state, noise, _FEW_STEPS)
+        learned = replace(current, noise=self.path.learn(current.residual, current.noise))
+        sets = iter(matrix.choose(self.given, self._banned))
+        for _ in range(_LOOKS):
+            looked = sorted(self._look(matrix, one) for one in islice(sets, _LOOKED))
+            best: tuple[float, PathFit] | None = None
+            for brings, _, state in looked[:_FITTED]:
+                if best is not None and not brings < _NEAR * looked[0][0]:
                     break
-                rough.append(approach(base, extension.add_to(base.state), screen.saturated.noise))
-                places -= find_cost(rough[-1]) < before  # noqa: PLW2901
-        expected = [(find_cost(one) - one.expected_fall, one) for one in rough]
-        for cost, start in sorted(expected, key=lambda pair: pair[0]):
-            if cost > reached + EQUAL + _NEAR * (before - reached):
-                break
-            fit = self._reduce(self.fit(start.state, most, start.noise), base)
-            if set(fit.ids) == set(base.ids):
-                continue
-            one = self._judge(base, fit, is_final=False)
-            if fit.ids not in judged or one.cost < judged[fit.ids].cost:
-                judged[fit.ids] = one
-            if not one.refusal:
-                reached = min(reached, one.cost)
-        return list(judged.values())
-
-    def _reduce(self, fit: PathFit, base: PathFit) -> PathFit:
-        """The fit with the simpler form of a new effect that has become one, and without idle old ones."""
-        for effect in fit.state.effects:
-            if effect.id in self.given or is_nameable(effect, self.conditions):
-                continue
-            simpler = effect.collapse() if effect.is_degenerate(self.conditions) else None
-            known = {one.id for one in self.candidates} - set(fit.ids)
-            if simpler is not None and simpler.id in known:
-                return self._reduce(self.fit(fit.state.drop([effect.id]).add(simpler)), base)
-            # A number of several that the driving leaves free may end anywhere: it is held at none.
-            free = [p for p in effect.parameters if p.name not in effect.fixed and math.isfinite(p.neutral)]
-            loose = {p.name: p.neutral for p in list_implausible(effect) if p in free}
-            least = [p for p in free if p.least is not None]
-            if loose and len(loose) < len(least):
-                held = effect.change(**loose).fix(*loose)
-                return self._reduce(self.fit(fit.state.add(held)), base)
-            if effect.id in base.ids:
-                # An effect that another one makes superfluous goes with it.
-                return self._reduce(self._drop(fit, [effect.id]), base)
-        return fit
-
-    def prune(self, fit: PathFit) -> PathFit:
-        """The model without effects that its others have made superfluous, the least evident first."""
-        while True:
-            free = [effect for effect in fit.state.effects if effect.id not in self.given]
-            weak = [one for effect in free if (one := (measure_t(fit, effect), effect.id))[0] < self._least_t]
-            if not weak:
-                return fit
-            fit = self._drop(fit, [min(weak)[1]])
-
-    def refuse(self, fit: PathFit) -> tuple[PathFit, dict[str, Judged]]:
-        """The model without effects that are not accepted beside its others, and how each was judged.
-
-        Effects whose numbers are correlated are judged together, too: one may only undo what the other does.
-        """
-        while True:
-            groups = self._list_groups(fit)
-            alone = {names[0]: self._judge_last(fit, names) for names in groups if len(names) == 1}
-            refused = [one for one in alone.values() if one.refusal]
-            if not refused:
-                pairs = (self._judge_last(fit, names) for names in groups if len(names) > 1)
-                refused = [one for one in pairs if one.refusal]
-            if not refused:
-                simpler = self._simplify(fit)
-                if simpler is None:
-                    return fit, alone
-                fit = simpler
-            while refused:
-                # The least gain goes first; without it the next may be accepted.
-                least = min(refused, key=lambda one: (float(np.nan_to_num(one.gain)), one.added))
-                fit = self._drop(fit, least.added)
-                others = [one.added for one in refused if not set(one.added) & set(least.added)]
-                refused = [one for names in others if (one := self._judge_last(fit, names)).refusal]
-
-    def _restore(
-        self, fit: PathFit, judged: dict[str, Judged], extended: PathFit
-    ) -> tuple[PathFit, dict[str, Judged]]:
-        """The model with what was refused beside effects that went after it, and is accepted without them."""
-        gone = [effect for effect in extended.state.effects if effect.id not in fit.ids]
-        for _ in gone:
-            tried = (self.fit(fit.state.add(one)) for one in gone if one.id not in fit.ids)
-            others = [self._judge(fit, one, is_final=True) for one in tried]
-            best = min((one for one in others if not one.refusal), key=lambda one: one.cost, default=None)
-            if best is None or not best.cost < find_cost(fit) - EQUAL:
-                break
-            fit, judged = self.refuse(best.fit)
-        return fit, judged
-
-    def _simplify(self, fit: PathFit) -> PathFit | None:
-        """The model with a special case in the place of what is not accepted, or not surely, beyond it."""
-        for effect in fit.state.effects:
-            taken = {effect.id, *self.given, *fit.ids}
-            cases = [one for one in self.candidates if one.id in effect.contains and one.id not in taken]
-            if effect.id in self.given or not cases:
-                continue
-            without = self._drop(fit, [effect.id])
-            for start in Screen(without, cases, self.conditions.largest).list_singles():
-                simpler = self.fit(start.add_to(without.state))
-                judged = self._judge(simpler, fit, is_final=True)
-                if judged.refusal or judged.frequency < _SURE:
-                    return simpler
+                fit = _fit_under(self.path, state, noise, _STEPS, find_cost(base))
+                fall = find_cost(fit) - find_cost(base)
+                fit = replace(fit, noise=self.path.learn(fit.residual, noise))
+                if find_cost(fit) < find_cost(learned) and (best is None or fall < best[0]):
+                    best = fall, fit
+            if best is not None and best[0] < -_FALL:
+                return self._simplify(best[1], noise)
         return None
 
-    def _judge_last(self, fit: PathFit, names: Collection[str]) -> Judged:
-        """How effects of the last model are judged against the model without them."""
-        return self._judge(self._drop(fit, names), fit, is_final=True)
+    def _look(self, matrix: Matrix, change: Change) -> tuple[float, tuple[str, ...], ModelState]:
+        """What a set brings at first sight, at the best of its starts."""
+        looks = list[tuple[float, int, ModelState]]()
+        for state in matrix.list_states(change):
+            free = self.path.list_free(state)
+            cost = measure_cost(self.path, matrix.noise, state, free, self.path.find_residuals(state))
+            looks.append((cost + _find_price(state, len(free)), len(looks), state))
+        cost, _, state = min(looks, key=lambda one: one[:2])
+        return cost - _measure_under(matrix.fit, matrix.noise), matrix.name(change), state
 
-    def _list_groups(self, current: PathFit) -> list[tuple[str, ...]]:
-        """Effects that may stand for others: each, and each two whose numbers the data hardly separate."""
-        free = [name for name in current.ids if name not in self.given]
-        size = np.sqrt(np.maximum(np.diag(current.covariance), 1e-300))
-        alike = np.abs(current.covariance / np.outer(size, size)) > _ALIKE
-        pairs = {
-            tuple(sorted((current.free[one].effect, current.free[other].effect)))
-            for one, other in zip(*np.nonzero(np.triu(alike, 1)), strict=True)
-        }
-        return [*((name,) for name in free), *(two for two in combinations(sorted(free), 2) if two in pairs)]
+    def _start_again(self, current: PathFit) -> PathFit | None:
+        """The same set from other starts of effects with several valleys; None where none is cheaper."""
+        best: tuple[float, PathFit] | None = None
+        for effect in current.state.effects:
+            candidate = next((one for one in self.candidates if one.id == effect.id), None)
+            if candidate is None or sum(one.effect == effect.id for one in current.free) < _FEWEST_STARTS:
+                continue
+            starts = [candidate(**values) for values in self._list_starts(candidate) if values]
+            starts += effect.list_alike()
+            begun = [begin_fit(self.path, current.state.add(one), current.noise) for one in starts]
+            for one in sorted(begun, key=lambda fit: fit.expected)[: (len(begun) + 1) // 2]:
+                fit = fit_roughly(one, _ANOTHER_STEPS)
+                fall = find_cost(fit) - find_cost(current)
+                if fall < -EQUAL and (best is None or fall < best[0]):
+                    best = fall, fit
+        return None if best is None else self._take(best[1], current, EQUAL)
 
-    def list_rivals(self, current: PathFit, without: PathFit, names: Sequence[str]) -> list[Judged]:
-        """Models with other effects in the place of some, judged against the one with neither; made once."""
-        key = (_make_key(current.state), *names, self.given)
-        if key not in self._rivals:
-            screen = self.screen(without, names)
-            own = without.score - current.score
-            wanted = 0.3 * own - PRICE * len(names)
-            self._rivals[key] = self._judge_extensions(without, screen, 4, 1, wanted, find_cost(current))
-        return self._rivals[key]
+    def _list_starts(self, candidate: Candidate) -> list[dict[str, float]]:
+        return list_starts(candidate, self.conditions.largest)
 
-    def replaces(self, current: PathFit, other: Judged, margin: float = 0.0) -> bool:
-        """Whether other effects do what one of a model does, and not only something else.
+    def _take(self, start: PathFit, current: PathFit, least: float) -> PathFit | None:
+        """A model fitted with its own noise, where it is cheaper by so much."""
+        fit = fit_path(self.path, start.state)
+        return fit if find_cost(fit) < find_cost(current) - least else None
 
-        Beside them it adds nothing then, and no part of them beside it is as good as they are.
+    def _try_wholes(self, current: PathFit) -> PathFit | None:
+        """The model with an effect of many numbers in the place of its special cases, where it is better."""
+        begun = list[tuple[float, str, PathFit]]()
+        for candidate in self.candidates:
+            effect = candidate()
+            searched = sum(p.search is HowSearched.STARTS for p in effect.parameters)
+            if not effect.contains or candidate.id in current.ids or searched < _FEWEST_STARTS:
+                continue
+            free = [name for name in current.ids if name not in self.given]
+            cases, beside = ([n for n in free if n in part] for part in (effect.contains, effect.companions))
+            if len(cases) + len(beside) < _FEWEST_STARTS or not effect.acts_in({*current.ids} - {*cases}):
+                continue
+            bases = [current.state.drop(gone) for gone in ([cases, cases + beside] if beside else [cases])]
+            states = [
+                base.add(candidate(**values)) for base in bases for values in self._list_starts(candidate)
+            ]
+            fits = [begin_fit(self.path, state, current.noise) for state in states]
+            expected = [one.expected + _find_price(one.state, one.numbers) for one in fits]
+            cost, _, best = min(zip(expected, range(len(fits)), fits, strict=True), key=lambda one: one[:2])
+            begun.append((cost, candidate.id, best))
+        ends = [
+            (find_cost(fit), name, fit)
+            for _, name, begin in sorted(begun, key=lambda one: one[:2])[:2]
+            for fit in (fit_roughly(begin, _HARD_STEPS),)
+        ]
+        if not ends:
+            return None
+        cost, name, fit = min(ends, key=lambda one: one[:2])
+        whole = fit.state.find(name)
+        if whole is None or not is_nameable(whole, self.conditions):
+            return None
+        without = [one for one in current.ids if one in (*whole.contains, *whole.companions)]
+        explained = _measure_under(current, current.noise, without) - _measure_under(current, current.noise)
+        if cost - find_cost(current) > max(_WHOLE_NEAR, _WHOLE_SHARE * explained):
+            return None
+        taken = self._take(fit, current, _WHOLE_FALL)
+        whole = None if taken is None else taken.state.find(name)
+        return taken if whole is not None and is_nameable(whole, self.conditions) else None
+
+    def _simplify(self, fit: PathFit, noise: Noise | None = None) -> PathFit:
+        """The model with special cases in the place of effects that they equal.
 
         Args:
-            current: the model.
-            other: the others in the place of one of its effects.
-            margin: by how much they must be better than each of them beside it.
+            fit: the model.
+            noise: under which models are compared; None for that of each.
         """
-        new = [effect for effect in other.fit.state.effects if effect.id not in current.ids]
-        if find_cost(self.fit(current.state.add(*new))) < other.cost - EQUAL:
-            return False
-        parts = new if len(new) > 1 else []
-        return all(find_cost(self.fit(current.state.add(one))) > other.cost + margin for one in parts)
 
-    def _try_whole(self, current: PathFit, candidate: Candidate) -> PathFit | None:
-        """The model with an effect in the place of its special cases and companions, where it is better."""
-        effect = candidate()
-        cases = [name for name in current.ids if name in (*effect.contains, *effect.companions)]
-        cases = [name for name in cases if name not in self.given]
-        if not effect.contains or not (cases or effect.starts) or candidate.id in current.ids:
-            return None
-        base, most = self._drop(current, cases), find_cost(current) - EQUAL
-        # Some steps show whether it may come near what its special cases explain.
-        rough = self._approach_all(base, candidate, current.noise)
-        near = most + EQUAL + _NEAR * (find_cost(base) - find_cost(current))
-        fits = [self.fit(one.state, most, one.noise) for one in rough if find_cost(one) < near]
-        fit = min(fits, key=find_cost, default=base)
-        if find_cost(fit) > most:
-            return None
-        judged = self._judge(base, fit, is_final=False)
-        return None if judged.refusal else self.prune(fit)
+        def refit(state: ModelState) -> PathFit:
+            if noise is None:
+                return fit_path(self.path, state)
+            return _fit_under(self.path, state, noise, _STEPS)
 
-    def _approach_all(self, base: PathFit, candidate: Candidate, noise: Noise) -> list[PathFit]:
-        """Some steps of the model with a candidate, from the better half of its starts."""
-        values = list_starts(candidate, self.conditions.largest)
-        return approach_each(base, [base.state.add(candidate(**one)) for one in values], noise)
+        while True:
+            collapsed = self._collapse(fit)
+            if collapsed is not None:
+                # What is degenerate is not tried again: it would only become this.
+                self._banned.add(tuple(sorted(fit.ids)))
+                fit = refit(collapsed)
+                continue
+            simpler = list[tuple[float, PathFit]]()
+            for name, state in self._list_simpler(fit):
+                key = (tuple(sorted(fit.ids)), name, tuple(sorted(state.ids)))
+                if key in self._tried:
+                    continue
+                self._tried.add(key)
+                one = refit(state)
+                if (rise := find_cost(one) - find_cost(fit)) < EQUAL:
+                    simpler.append((rise, one))
+            if not simpler:
+                return fit
+            fit = min(simpler, key=lambda one: one[0])[1]
 
-    def _try_beside(self, current: PathFit, candidate: Candidate) -> PathFit | None:
-        """The model with a companion of its effects, where it is better.
+    def _collapse(self, fit: PathFit) -> ModelState | None:
+        """The model with what a degenerate effect has become in its place, or nothing; None without one."""
+        known = {one.id for one in self.candidates}
+        for effect in fit.state.effects:
+            if effect.id not in self.given and effect.is_neutral:
+                return fit.state.drop([effect.id])
+            if effect.id in self.given or not effect.is_degenerate(self.conditions):
+                continue
+            simple = effect.collapse()
+            if simple is None or simple.id not in known:
+                continue
+            rest = fit.state.drop([effect.id])
+            held = {*rest.ids}.union(*(one.contains for one in rest.effects))
+            return rest if simple.id in held else rest.add(simple)
+        return None
 
-        What a limit of the command promises to first order says nothing beside a servo, all of whose numbers
-        change with it.
-        """
-        if candidate.id in current.ids or not candidate().acts_in(current.ids):
-            return None
-        most = find_cost(current) - EQUAL
-        best = min(self._approach_all(current, candidate, current.noise), key=find_cost, default=None)
-        if best is None:
-            return None
-        fit = self._reduce(self.fit(best.state, most, best.noise), current)
-        judged = self._judge(current, fit, is_final=False)
-        is_better = judged.added and not judged.refusal and judged.cost < most
-        return self.prune(fit) if is_better else None
+    def _list_simpler(self, fit: PathFit) -> Iterator[tuple[str, ModelState]]:
+        """Models with special cases in the place of an effect, begun at its values."""
+        for effect in fit.state.effects:
+            if effect.id in self.given:
+                continue
+            rest = fit.state.drop([effect.id])
+            for whole in rest.effects:
+                if effect.id in whole.contains and {*effect.values} == {"tau"}:
+                    slower = {
+                        name: value + effect.values["tau"]
+                        for name, value in whole.values.items()
+                        if name.startswith("tau") and math.isfinite(value)
+                    }
+                    if slower:
+                        yield effect.id, rest.add(whole.change_within(**slower))
+            cases = list(self._list_cases(effect, fit.ids))
+            if any(case.id in whole.contains for case in cases for whole in rest.effects):
+                yield effect.id, rest
+            yield from ((effect.id, rest.add(case)) for case in cases)
+            if len(cases) > 1:
+                yield effect.id, rest.add(*cases)
+
+    def _list_cases(self, effect: Effect, ids: Collection[str]) -> Iterator[Effect]:
+        """Special cases of an effect at its values: of equal names its own, of time constants their mean."""
+        for candidate in self.candidates:
+            if candidate.id not in effect.contains or candidate.id in ids:
+                continue
+            names = {p.name for p in candidate.parameters}
+            same = {name: effect.values[name] for name in names & {*effect.values}}
+            taus = [value for name, value in effect.values.items() if name.startswith("tau")]
+            if names == {*same} and all(map(math.isfinite, same.values())):
+                yield candidate(**same)
+            elif names == {"tau"} and taus:
+                yield candidate(tau=sum(taus) / len(taus))
+
+    def name_all(self, fit: PathFit) -> tuple[PathFit, dict[str, Judged]]:
+        """The model without effects that are not proven beside its others, and how each was judged."""
+        while True:
+            judged = self.judge_all(fit)
+            refused = [one for one in judged.values() if not one.is_proven]
+            if not refused:
+                return fit, judged
+            least = min(refused, key=lambda one: (one.frequency, one.t, one.effect))
+            fit = fit_path(self.path, fit.state.drop([least.effect]), noise=fit.noise)
+
+    def judge_all(self, fit: PathFit) -> dict[str, Judged]:
+        """How each effect of a model is judged, but for given ones and those too small for a name."""
+        asked = [
+            one for one in fit.state.effects if one.id not in self.given and not self._is_small(fit, one)
+        ]
+        if not asked:
+            return {}
+        matrix = Matrix(fit, (), self.conditions.largest)
+        return {one.id: judge(fit, one, matrix, self.conditions, self.least_t) for one in asked}
+
+    def _list_rivals(self, final: PathFit, matrix: Matrix, judged: dict[str, Judged]) -> Iterator[Rival]:
+        """Effects that in a tenth of resampled recordings would be in the place of one that is named."""
+        own = _sum_blocks(final, final.noise)
+        weights = _resample(own.size)
+        for name in (name for name, one in judged.items() if not one.refusal):
+            brings = matrix.promise(Change().drop(name))
+            others = [
+                one for one in matrix.list_replacements(name) if matrix.promise(one) < _PROMISING * brings
+            ]
+            for change in others[:_RIVALS]:
+                _, _, state = self._look(matrix, change)
+                fit = fit_path(self.path, state, noise=final.noise)
+                (other,) = (matrix.trials[index].effect.id for index in change.added)
+                effect = fit.state.find(other)
+                if effect is None or not any(
+                    is_nameable(one, self.conditions) for one in _list_acting(fit, effect)
+                ):
+                    continue
+                behind = _sum_blocks(fit, final.noise) - own
+                price = _find_price(fit.state, fit.numbers) - _find_price(final.state, final.numbers)
+                if float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN:
+                    yield Rival(name, other, fit, find_cost(fit) - find_cost(final))
 
 
-def _make_key(state: ModelState) -> tuple[object, ...]:
-    """What two equal states have in common."""
-    return (*((effect.key, effect.fixed) for effect in state.effects), repr(state.own))
+def _fit_under(
+    path: PathResiduals, state: ModelState, noise: Noise, steps: int, most: float = math.inf
+) -> PathFit:
+    """A fit under a given noise; it ends early where it cannot cost less than `most`."""
+    fit = begin_fit(path, state, noise)
+    return fit_roughly(fit, steps, most - _find_price(state, fit.numbers))
 
 
-def _choose(judged: Sequence[Judged]) -> Judged | None:
-    """Of models within `EQUAL` of the best, that with fewest numbers; None of none."""
-    least = min((one.cost for one in judged), default=math.inf)
-    near = [one for one in judged if one.cost < least + EQUAL]
-    return min(near, key=lambda one: (one.fit.numbers, one.cost), default=None)
+def _measure_under(fit: PathFit, noise: Noise, without: Collection[str] = ()) -> float:
+    """Cost of a model under a noise, some effects taken out, but for the logarithms of the variances."""
+    path, state = fit.path, fit.state.drop(without) if without else fit.state
+    free = path.list_free(state) if without else fit.free
+    residual = path.find_residuals(state) if without else fit.residual
+    return measure_cost(path, noise, state, free, residual) + _find_price(state, len(free))
+
+
+def _resample(count: int) -> Floats:
+    """How often each block is in each resampled recording, shape (draws, blocks)."""
+    drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=_DRAWS)
+    return np.asarray(drawn, dtype=np.float64)
+
+
+def _sum_blocks(fit: PathFit, noise: Noise) -> Floats:
+    """Cost of the residuals of a fit in each block, shape (blocks,)."""
+    return np.asarray(
+        np.bincount(fit.path.block, list_costs(fit.path, noise, fit.residual)), dtype=np.float64
+    )
 
 
 def measure_t(
@@ -567,63 +533,82 @@ def measure_t(
 
 
 def judge(
-    base: PathFit, fit: PathFit, conditions: Conditions, least_t: float = LEAST_T, *, is_final: bool = True
+    fit: PathFit, effect: Effect, matrix: Matrix, conditions: Conditions, least_t: float = LEAST_T
 ) -> Judged:
-    """Accept an extension of a model, or say why not.
-
-    Both are judged by the noise of the larger model: that of the smaller one would hide what it lacks.
+    """Give an effect of a model its name, or say why not.
 
     Args:
-        base: the smaller model.
-        fit: the larger one.
+        fit: the model.
+        effect: as it is there.
+        matrix: of the model.
         conditions: what the runs can show.
-        least_t: standard errors that each new effect must be from none.
-        is_final: whether the larger model is the last one. On the way there, errors may rise until what comes
-            next is in, and a fall of half as much is enough.
+        least_t: standard errors that it must be from none.
     """
-    added = tuple(name for name in fit.ids if name not in base.ids)
-    new = [effect for effect in fit.state.effects if effect.id in added]
-    for effect in new:
-        wrong = _refuse_numbers(base, fit, effect, conditions, least_t, is_final=is_final)
-        if wrong:
-            return Judged(base, fit, added, f"{effect.id}: {wrong}")
-    path, noise = fit.path, fit.noise
-    costs = [list_costs(path, noise, one.held_out) for one in (base, fit)]
+    path, base = fit.path, drop_linearly(fit, effect.id)
+    gone = Change().drop(effect.id)
+    brings = matrix.sum_blocks(gone) - matrix.sum_blocks(Change())
+    price = matrix.find_price(Change()) - matrix.find_price(gone)
+    frequency = float(np.mean(_resample(brings.size) @ brings > price))
+    costs = [list_costs(path, fit.noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
-    own = list_costs(path, noise, base.residual) - list_costs(path, noise, fit.residual)
-    by_unit = np.asarray(np.bincount(path.unit, own), dtype=np.float64)
-    stable = math.sqrt(max(float(by_unit.sum() - by_unit.max()), 0.0))
-    falls, rise, risen = _compare_horizons(base.horizon_errors, fit.horizon_errors)
-    most = float(np.nanmax(falls, initial=0.0))
-    refusal = ""
-    if not gain > 0.0:
-        refusal = "the held-out error does not fall"
-    elif stable < STABLE_T:
-        refusal = "ten seconds bring it all"
-    elif (is_final and rise > _RISE) or float(np.nanmin(falls, initial=0.0)) < -most:
-        refusal = f"the error {risen} rises"
-    elif most < (SHOWN if is_final else SHOWN / 2.0):
-        refusal = f"no error falls by more than {format_share(most)}"
-    elif not _is_material(path, base.residual - fit.residual):
-        refusal = "nobody would notice it"
-    sums = [np.bincount(path.block, cost) for cost in costs]
-    draws = np.random.default_rng(0).integers(0, sums[0].size, (_DRAWS, sums[0].size))
-    frequency = float(np.mean(sums[1][draws].sum(axis=1) < sums[0][draws].sum(axis=1)))
-    return Judged(base, fit, added, refusal, gain, frequency, by_unit, falls)
-
-
-def _refuse_numbers(
-    base: PathFit, fit: PathFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
-) -> str:
-    """Why an effect's numbers do not allow a name, empty where they do; see `judge`."""
+    own = list_costs(path, fit.noise, base.residual) - list_costs(path, fit.noise, fit.residual)
+    evidence = np.asarray(np.bincount(path.unit, own), dtype=np.float64)
+    t, change = measure_t(fit, effect, base), base.residual - fit.residual
+    felt = _find_expected_fall(fit, change)
+    refusal, is_proven = "", False
     if not any(is_nameable(one, conditions) for one in _list_acting(fit, effect)):
-        return "its values are not possible"
-    t = measure_t(fit, effect, base)
-    if t < least_t:
-        return f"t = {t:.1f}"
-    if is_final and measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
-        return "its interval holds no effect"
-    return ""
+        refusal = "its values are not possible"
+    elif t < least_t:
+        refusal = f"t = {t:.1f}"
+    elif measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
+        refusal = "its interval holds no effect"
+    elif frequency < _SURE:
+        refusal = f"in {format_share(frequency)} of resampled recordings it pays for its numbers"
+    elif not gain > 0.0:
+        refusal = "the held-out error does not fall"
+    else:
+        is_proven = True
+        if felt < SHOWN:
+            refusal = f"no error falls by more than {format_share(felt)}"
+        elif not _is_material(path, change):
+            refusal = "nobody would notice it"
+    return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
+
+
+def drop_linearly(fit: PathFit, name: str) -> PathFit:
+    """A model without one of its effects, its other numbers adapted by one linear step."""
+    path, state = fit.path, fit.state.drop([name])
+    residual = path.find_residuals(state)
+    places = [index for index, number in enumerate(fit.free) if number.effect != name]
+    free, columns = tuple(fit.free[index] for index in places), pick_columns(fit.columns, places)
+    smooth = [index for index, number in enumerate(free) if number.is_smooth]
+    if smooth:
+        moving = pick_columns(columns, smooth)
+        for _ in range(3):
+            # Outliers are others without the effect.
+            white = whiten(path, fit.noise, residual, moving)
+            step = invert(white.columns.T @ white.columns) @ (white.columns.T @ white.residual)
+            residual = residual - combine_columns(moving, step)
+    return PathFit(path, state, free, residual, columns, fit.noise)
+
+
+def _find_expected_fall(fit: PathFit, change: Floats) -> float:
+    """The largest relative fall of an error that is expected of an effect by the motion it makes.
+
+    What a run's own errors happen to be beside it is chance, above all over few long stretches.
+
+    Args:
+        fit: the model with it.
+        change: of the predicted increments by it, beside what the other numbers take over, shape (n, 3).
+    """
+    falls = [0.0]
+    errors = zip(fit.horizon_errors, fit.path.list_horizon_errors(change), strict=True)
+    for left, moved in errors:
+        for name in ("position", "heading"):
+            one, other = getattr(left, name), getattr(moved, name)
+            if one.size and one.mean() + other.mean() > 0.0:
+                falls.append(1.0 - math.sqrt(one.mean() / (one.mean() + other.mean())))
+    return max(falls)
 
 
 def _list_acting(fit: PathFit, effect: Effect) -> list[Effect]:
@@ -652,32 +637,3 @@ def list_costs(path: PathResiduals, noise: Noise, residual: Floats) -> Floats:
     innovations = noise.whiten(residual[:, :, None], path.steps)
     costs: Floats = huber_cost(innovations).sum(axis=(1, 2))
     return costs
-
-
-def _compare_horizons(
-    before: Sequence[HorizonError], after: Sequence[HorizonError]
-) -> tuple[Floats, float, str]:
-    """Relative falls of errors, shape (4, 2), the largest rise beyond chance, and where one rises most."""
-    falls, rise, risen = np.full((len(HORIZONS_S), 2), math.nan), 0.0, ""
-    least_p, largest = _RISEN / falls.size, 0.0
-    for index, (old, new, horizon) in enumerate(zip(before, after, HORIZONS_S, strict=True)):
-        for channel, name in enumerate(("position", "heading")):
-            one, other = getattr(old, name), getattr(new, name)
-            if not one.size or not one.mean() > 0.0:
-                continue
-            fall = falls[index, channel] = 1.0 - math.sqrt(float(other.mean() / one.mean()))
-            if -fall > largest:
-                length = "a whole stretch" if math.isinf(horizon) else f"{horizon:g} s"
-                largest, risen = -fall, f"in {name} over {length}"
-            if -fall > rise and _find_chance(other - one, old.block) < least_p:
-                rise = -fall
-    return falls, rise, risen
-
-
-def _find_chance(rises: Floats, block: Ints) -> float:
-    """Probability that the sums over blocks are as large as they are by chance, by Student's t."""
-    sums = np.bincount(np.unique(block, return_inverse=True)[1], rises)
-    if sums.size == 1:
-        return 1.0
-    t = float(sums.mean()) * math.sqrt(sums.size) / max(float(sums.std(ddof=1)), 1e-300)
-    return float(stdtr(sums.size - 1, -t))

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import FOLDS
-from pipeline.estimation.model_state import combine_columns, flatten, pick_columns
-from pipeline.estimation.noise import find_weights, huber_cost
+from pipeline.estimation.model_state import combine_columns, flatten, make_columns, pick_columns
+from pipeline.estimation.noise import NO_NOISE, find_weights, huber_cost
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.core import Flags, Floats, Ints
-    from pipeline.estimation.model_state import Free, ModelState
+    from pipeline.estimation.model_state import Free, FreeKey, ModelState
     from pipeline.estimation.noise import Noise
     from pipeline.estimation.path_residuals import HorizonError, PathResiduals
 
@@ -39,10 +39,8 @@ recordings, one in fifty brought more."""
 _NO_INFLUENCE = 1e-6
 """Change of the innovations, in standard deviations over the whole run, by a parameter's step: a number with
 less, such as that of a limit that is never reached, stays where it is."""
-_MOST_STEPS, _FEW_STEPS = 30, 3
-"""Steps of a fit, and fewest of one that shows whether a model may come near the best one."""
-_SHARES = (1.0, 0.5, 0.25, 0.1)
-"""Shares of an extension's start at one of which its fit begins: where the cost is least."""
+_MOST_STEPS = 30
+"""Steps of a fit."""
 _GRID = ((1.0, 8), (0.3, 3), (0.1, 2))
 """Grids of a number without derivatives: their spacing in its steps, and the values on either side."""
 _MOST_WALKS = 4
@@ -120,6 +118,15 @@ class PathFit:
         return columns.T @ columns + prior
 
     @cached_property
+    def widths(self) -> dict[FreeKey, float]:
+        """Over what derivatives are taken next: standard error of each number if all others were known."""
+        known = np.sqrt(np.diag(self.normal)).tolist()
+        return {
+            number.key: 1.0 / one if one > 0.0 else math.inf
+            for number, one in zip(self.free, known, strict=True)
+        }
+
+    @cached_property
     def score(self) -> float:
         """Minus twice the logarithm of the likelihood: smaller is better, also between kinds of noise."""
         path = self.path
@@ -133,9 +140,9 @@ class PathFit:
         return max(_sum_squares(self.white.residual) / count, 1.0)
 
     @cached_property
-    def expected_fall(self) -> float:
-        """Fall of chi-square that is expected of its next step."""
-        return _solve(self, _LOOSEST)[2]
+    def expected(self) -> float:
+        """Score that is expected after its next step."""
+        return self.score - _solve(self, _LOOSEST)[2]
 
     @cached_property
     def covariance(self) -> Floats:
@@ -219,7 +226,6 @@ def fit_path(
     noise: Noise | None = None,
     per_run: Sequence[str] = (),
     exact: bool = False,
-    target: float = math.inf,
 ) -> PathFit:
     """Fit all numbers of a state to one path, with the noise of its residuals.
 
@@ -231,12 +237,12 @@ def fit_path(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
-        target: score that it must come below: it ends early where its steps do not promise that.
     """
-    fit = _begin(path, start, noise, per_run, exact=exact)
+    fit = _begin(path, start, per_run)
+    fit = replace(fit, noise=path.learn(fit.residual, noise, exact=exact))
     if not fit.free:
         return fit
-    fit = _descend(fit, exact=exact, target=target)
+    fit = _descend(_differentiate(fit), exact=exact)
     for _ in range(_MOST_WALKS if len(fit.smooth) < len(fit.free) else 0):
         before = fit.score
         fit = _walk_grids(fit, exact=exact)
@@ -245,19 +251,31 @@ def fit_path(
     return replace(fit, state=fit.state.centred)
 
 
-def _begin(
-    path: PathResiduals,
-    start: ModelState,
-    noise: Noise | None,
-    per_run: Sequence[str] = (),
-    *,
-    exact: bool = False,
-) -> PathFit:
-    """A fit before its first step; see `fit_path`."""
-    free = path.list_free(start, per_run)
-    residual = path.find_residuals(start)
-    columns = path.differentiate(start, residual, free, both_sides=exact)
-    return PathFit(path, start, free, residual, columns, path.learn(residual, noise, exact=exact))
+def begin_fit(path: PathResiduals, start: ModelState, noise: Noise) -> PathFit:
+    """A fit before its first step."""
+    return _differentiate(replace(_begin(path, start), noise=noise))
+
+
+def fit_roughly(fit: PathFit, steps: int, target: float = math.inf) -> PathFit:
+    """Some steps of a fit, with the noise as it is.
+
+    Args:
+        fit: where to begin.
+        steps: most steps.
+        target: score that it must come below: it ends early where its steps do not promise that.
+    """
+    return _walk_grids(_descend(fit, rough=steps, target=target)) if fit.free else fit
+
+
+def _begin(path: PathResiduals, start: ModelState, per_run: Sequence[str] = ()) -> PathFit:
+    """A fit without derivatives and noise."""
+    free, residual = path.list_free(start, per_run), path.find_residuals(start)
+    return PathFit(path, start, free, residual, make_columns(residual.shape[0], len(free)), NO_NOISE)
+
+
+def _differentiate(fit: PathFit, widths: Mapping[FreeKey, float] | None = None) -> PathFit:
+    """The fit with the derivatives of its place."""
+    return replace(fit, columns=fit.path.differentiate(fit.state, fit.residual, fit.free, widths))
 
 
 def _walk_grids(fit: PathFit, *, exact: bool = False) -> PathFit:
@@ -266,46 +284,6 @@ def _walk_grids(fit: PathFit, *, exact: bool = False) -> PathFit:
         if not number.is_smooth:
             fit = _walk_grid(fit, number, exact=exact)
     return fit
-
-
-def approach(base: PathFit, start: ModelState, noise: Noise) -> PathFit:
-    """Some steps of a fit from a model's extension, which show how near it may come to the best one.
-
-    Args:
-        base: the fitted model.
-        start: the extension, at a start of its new numbers.
-        noise: what a good model leaves.
-    """
-    return _go_on(_begin_extension(base, start), base, noise)
-
-
-def approach_each(base: PathFit, starts: Sequence[ModelState], noise: Noise) -> list[PathFit]:
-    """`approach` from the better half of some starts: those whose first step promises least cost."""
-    extended = [_begin_extension(base, start) for start in starts]
-    extended.sort(key=lambda fit: fit.score - fit.expected_fall)
-    return [_go_on(fit, base, noise) for fit in extended[: (len(extended) + 1) // 2]]
-
-
-def _begin_extension(base: PathFit, start: ModelState) -> PathFit:
-    """An extension at that share of its start where the cost is least, with the noise of the model."""
-    path, new = base.path, set(start.ids) - set(base.ids)
-    weaker = [start.weaken(new, share) for share in _SHARES]
-    if weaker[-1] != weaker[0]:
-        path.look_ahead(weaker)
-        costs = [measure_cost(path, base.noise, one, base.free, path.find_residuals(one)) for one in weaker]
-        own = measure_cost(path, base.noise, base.state, base.free, base.residual)
-        # What changes nothing at all has no derivative, either.
-        acting = [pair for pair in zip(costs, weaker, strict=True) if abs(pair[0] - own) > _ENOUGH]
-        start = min(acting, key=lambda pair: pair[0], default=(0.0, start))[1]
-    free, residual = path.list_free(start), path.find_residuals(start)
-    return PathFit(path, start, free, residual, path.differentiate(start, residual, free), base.noise)
-
-
-def _go_on(fit: PathFit, base: PathFit, noise: Noise) -> PathFit:
-    """An extension of a model after some steps; see `approach`."""
-    steps = max(_FEW_STEPS, fit.numbers - base.numbers)
-    fit = _walk_grids(_descend(fit, rough=steps)) if fit.free else fit
-    return replace(fit, noise=fit.path.learn(fit.residual, noise))
 
 
 def measure_cost(
@@ -364,7 +342,7 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
             cost, fallen = measure_cost(path, fit.noise, fit.state, free, fit.residual), 0.0
             most_cost = target - fit.noise.log_variance(path.steps, path.weight)
         if (fall > 0.0 or not is_fresh) and count != rough:
-            fit = replace(fit, columns=path.differentiate(fit.state, fit.residual, free, both_sides=exact))
+            fit = _differentiate(fit, fit.widths)
         is_fresh, before = True, math.inf
     return fit
 
@@ -426,10 +404,7 @@ def _walk_grid(fit: PathFit, number: Free, *, exact: bool) -> PathFit:
         return fit
     state = fit.state.set(number, best)
     residual = path.find_residuals(state)
-    moved = replace(
-        fit, state=state, residual=residual, columns=path.differentiate(state, residual, fit.free)
-    )
-    beyond = _descend(moved, exact=exact)
+    beyond = _descend(_differentiate(replace(fit, state=state, residual=residual), fit.widths), exact=exact)
     return beyond if beyond.score < fit.score else fit
 
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
-from pipeline.estimation.candidates import Screen, Unset
+from pipeline.estimation.candidates import Unset
 from pipeline.estimation.fit import PathFit, fit_path
+from pipeline.estimation.matrix import Matrix
 from pipeline.models import Model
 
 if TYPE_CHECKING:
@@ -111,9 +112,9 @@ def _fit_from(
     fit = fit_path(path, state.drop([effect.id for effect in fresh]), per_run=per_run)
     for effect in fresh:
         extended = fit.state.add(effect)
-        starts = Screen(fit, [Unset(effect)], data.largest).list_starts()
-        if starts:
-            extended = starts[0].add_to(fit.state)
+        matrix = Matrix(fit, [Unset(effect)], data.largest)
+        for best in matrix.list_singles():
+            extended = matrix.list_states(best)[0]
             started = extended.find(effect.id)
             # Values that the start does not change may be fitted here.
             extended = extended if started is None else extended.add(effect.change(**started.values))

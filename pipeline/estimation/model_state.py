@@ -48,7 +48,9 @@ def combine_columns(columns: Floats, step: Floats) -> Floats:
     return (flatten(columns) @ step).reshape(columns.shape[:2])
 
 
-DelayName = Literal["wheel_delay_s"]
+DelayName = Literal["wheel_delay_s", "encoder_delay_s"]
+FreeKey = tuple[str, str, tuple[int, ...]]
+"""Effect, name and runs of a number."""
 Own = Mapping[int, Mapping[tuple[str, str], float]]
 
 DELAY_STEP = 5e-3
@@ -57,9 +59,9 @@ _LARGEST_DELAY = 0.6
 """Largest delay of encoders that is fitted [s]: the largest that `trust.estimate_delay` looks for."""
 
 
-_NARROW = 0.01
-"""Share of a parameter's step for a derivative away from the bounds: with whole steps, half of the fits to
-ice end 8 above the least cost, with a tenth .5, with a hundredth or a thousandth .3."""
+_NARROW, _WIDE = 0.01, 0.2
+"""Least width of a derivative in steps of the number, and the largest beside a step, as a share of its
+value."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Free:
         return f"{self.effect or 'timing'}.{self.name}"
 
     @property
-    def key(self) -> tuple[str, str, tuple[int, ...]]:
+    def key(self) -> FreeKey:
         """Its effect, name and runs, the same at other bounds."""
         return self.effect, self.name, self.runs
 
@@ -107,14 +109,26 @@ class Free:
         """A value held to the bounds."""
         return min(max(value, self.bounds[0]), self.bounds[1])
 
-    def step_aside(self, value: float, *, both_sides: bool) -> tuple[float, ...]:
-        """Values beside one for its derivative, close to it: one above, or one on either side."""
-        low, high = self.bounds
-        above, below = value + _NARROW * self.step, value - _NARROW * self.step
+    def list_ends(self, value: float, width: float = math.nan) -> tuple[float, ...]:
+        """Values beside one between which its derivative is taken: on either side, or on one at a bound.
+
+        The cost has a kink wherever a limit or friction begins to act. A derivative over what the data
+        resolve sees through them; one over a small step sees but one side, and fits end anywhere.
+
+        Args:
+            value: where.
+            width: standard error of the number if all others were known; NaN where it is not known yet.
+        """
+        (low, high), narrow = self.bounds, _NARROW * self.step
+        if not self.is_smooth:
+            width = narrow
+        width = self.step if math.isnan(width) else min(max(width, narrow), _WIDE * abs(value) + self.step)
+        below, above = value - width, value + width
         if low <= below and above <= high:
-            return (below, above) if both_sides else (above,)
+            return below, above
         # At a bound, the influence of a parameter may grow with its square.
-        return (value + self.step if value + self.step <= high else value - self.step,)
+        width = max(width, self.step)
+        return (min(value + width, high),) if high - value >= value - low else (max(value - width, low),)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import compiled
-from pipeline.estimation.model_state import NO_PRIOR, DelayName, Free, ModelState, Prior, make_columns
+from pipeline.estimation.model_state import (
+    NO_PRIOR,
+    DelayName,
+    Free,
+    FreeKey,
+    ModelState,
+    Prior,
+    make_columns,
+)
 from pipeline.estimation.noise import Steps, learn_noise
 from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import average_windows, locate_windows, number_stretches
@@ -31,6 +39,8 @@ HORIZONS_S = (0.5, 2.0, 10.0, math.inf)
 """Times [s] after which errors of predictions are compared; infinite for whole stretches without a gap."""
 CLOCK_STEP_S = 5e-3
 """Step of a derivative by the delay of a clock [s]: a quarter of a cell."""
+_MOST_PERIODS = 2.0
+"""Largest delay of encoders against the commands, in their periods."""
 _NO_DELAY = Timing()
 _UNIFORM = 12.0**0.5
 """Ratio of width and standard deviation of a uniform distribution."""
@@ -104,7 +114,7 @@ class PathResiduals(ABC):
         return tuple(
             number
             for number in state.list_free(self.delays, (*self.clocks, *per_run), self.grounds)
-            if number.effect or self.residuals_by_run[number.runs[0]].has_gyro
+            if number.effect or not self.dates_poses or self.residuals_by_run[number.runs[0]].has_gyro
         )
 
     @abstractmethod
@@ -179,7 +189,11 @@ class PathResiduals(ABC):
         return learn_noise(residual, self.steps, self.channels, start, exact=exact)
 
     def differentiate(
-        self, state: ModelState, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
+        self,
+        state: ModelState,
+        residual: Floats,
+        free: Sequence[Free],
+        widths: Mapping[FreeKey, float] | None = None,
     ) -> Floats:
         """Derivative of the prediction by each number, shape (n, 3, p).
 
@@ -187,9 +201,10 @@ class PathResiduals(ABC):
             state: where.
             residual: its residuals, shape (n, 3).
             free: the numbers.
-            both_sides: use central differences where the bounds allow it, so that fits end alike.
+            widths: over what each is taken, see `Free.list_ends`.
         """
-        ends = [number.step_aside(state.get(number), both_sides=both_sides) for number in free]
+        known = widths or {}
+        ends = [number.list_ends(state.get(number), known.get(number.key, math.nan)) for number in free]
         moved = [[state.set(number, at) for at in steps] for number, steps in zip(free, ends, strict=True)]
         self.look_ahead([one for states in moved for one in states])
         columns = make_columns(residual.shape[0], len(free))
@@ -328,7 +343,7 @@ class WheelResiduals(PathResiduals):
         sideways: bool,
         exceeded: Mapping[str, float],
     ) -> None:
-        super().__init__([run_residuals.stepped.where_read for run_residuals in commanded])
+        super().__init__([one.stepped.where_read for one in commanded], ("encoder_delay_s",))
         self._exceeded = exceeded
         self.channels = (0, 1, 2) if sideways else (0, 2)
         self.measured = tuple(measured)
@@ -344,6 +359,10 @@ class WheelResiduals(PathResiduals):
         return tuple(self._bound(state, number) for number in super().list_free(state, per_run))
 
     def _bound(self, state: ModelState, number: Free) -> Free:
+        if not number.effect:
+            # What encoders report is a period old, or two where another one sends it on.
+            most = _MOST_PERIODS * self.residuals_by_run[number.runs[0]].run.wheel_period_s
+            return replace(number, bounds=(0.0, max(most, CLOCK_STEP_S)))
         effect = state.find(number.effect)
         of = "" if effect is None else effect.parameter(number.name).relative_to
         low, high = number.bounds
@@ -352,7 +371,7 @@ class WheelResiduals(PathResiduals):
 
     def find_velocities(self, state: ModelState, run: int) -> Floats:
         """See `PathResiduals`; in terms of the ideal velocity of the wheels."""
-        return self._compare(state, run, state.timing[run].wheel_delay_s)
+        return self._compare(state, run, state.timing[run].encoder_delay_s)
 
     def _compare(self, state: ModelState, run: int, late: float) -> Floats:
         """Velocities with the encoders delayed by ``late`` [s]."""
@@ -375,7 +394,7 @@ class WheelResiduals(PathResiduals):
     def list_rolled(self, state: ModelState) -> tuple[Floats, float]:
         """See `PathResiduals`: the measured wheels, which body commands are compared with."""
         seen = [
-            one.predict_velocity((), Timing(state.timing[run].wheel_delay_s))
+            one.predict_velocity((), Timing(state.timing[run].encoder_delay_s))
             for run, one in enumerate(self.measured)
         ]
         is_body = all(one.run.alignment.body_multiplier is not None for one in self.residuals_by_run)
@@ -383,7 +402,7 @@ class WheelResiduals(PathResiduals):
 
     def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
         """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
-        return self._multiply(self._compare(state, run, state.timing[run].wheel_delay_s + late_s), run)
+        return self._multiply(self._compare(state, run, state.timing[run].encoder_delay_s + late_s), run)
 
 
 def _group_by_ground(residuals_by_run: Sequence[RunResiduals]) -> tuple[tuple[int, ...], ...]:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.estimation.candidates import PRICE
-from pipeline.estimation.decision import EQUAL, Search, SearchResult, find_cost
+from pipeline.estimation.candidates import PRICE, SHAPES
+from pipeline.estimation.decision import EQUAL, LEAST_T, Search, SearchResult, find_cost
 from pipeline.estimation.errors import errors_as_json
+from pipeline.estimation.fit import fit_path
 from pipeline.estimation.ladder import judge_whole, lowers_errors
 from pipeline.estimation.terms import CHANNELS, is_term, join_formula, list_terms
 from pipeline.models import Timing, format_effect
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.run_residuals import RunResiduals
     from pipeline.models import FormulaEffect
 
-_SHAPES = 8640
-"""Shapes of formulas that one is the best of, for which it pays: for those of the terms alone it displaces
-effects of the catalogue that are right (a lateral skid, drawn sets, seed 44)."""
 _SAME = 0.8
 """Share of what a formula explains from which on an effect of the catalogue explains the same."""
 _LASTS_S = 1.5
@@ -43,7 +41,7 @@ _LEAST_OF_MOTION = 0.05
 def search_formula(
     search: Search, outcome: SearchResult, *, sideways: bool
 ) -> tuple[SearchResult, FormulaEffect | None]:
-    """A formula of up to three terms for what the accepted effects leave, or for one that only imitates it.
+    """A formula of some terms for what the accepted effects leave, or for one that only imitates it.
 
     Terms pass the same acceptance as effects, at the price of the shapes that they are the best of. What an
     effect of the catalogue would explain as well is no formula, whether or not it was accepted.
@@ -53,45 +51,23 @@ def search_formula(
     """
     first, *others = search.path.residuals_by_run
     wheels = not others and first.context.vehicle.kind == "differential"
-    terms = list_terms(sideways=sideways, wheels=wheels)
-    final = outcome.final
-    wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
-    offers: list[tuple[PathFit, PathFit, float]] = []
-    if wide.screen(final).list_singles():
-        beside = wide.run(final.state)
-        for fit in (beside.final, *(rival.judged.fit for rival in beside.rivals)):
-            # An effect that only imitated what a formula describes goes.
-            beside_it = replace(search, given=search.given.union(one.id for one in _list_terms(fit)))
-            offer, _ = beside_it.refuse(fit)
-            gone = set(final.ids) - set(offer.ids)
-            offers.append(
-                (offer, search.fit(final.state.drop(gone)), 2.0 * PRICE) if gone else (offer, final, EQUAL)
-            )
-    for name in outcome.new:
-        # In the place of an effect it must be far better than beside it.
-        rivals = wide.list_rivals(final, outcome.judged[name].base, [name])
-        offers += [
-            (one.fit, one.base, 2.0 * PRICE)
-            for one in rivals
-            if not one.refusal and wide.replaces(final, one, 2.0 * PRICE)
-        ]
-    better = [
-        (cost, fit, without)
-        for fit, without, margin in offers
-        if _list_terms(fit)
-        and (cost := find_cost(fit) + 2.0 * math.log(_SHAPES) * len(_list_terms(fit)))
-        < find_cost(final) - margin
-    ]
-    if not better:
+    final, terms = outcome.final, list_terms(sideways=sideways, wheels=wheels)
+    wide = replace(search, candidates=terms, least_t=math.sqrt(LEAST_T**2 + 2.0 * math.log(SHAPES)))
+    fit, judged = wide.name_all(wide.search_possible(final))
+    gone = set(final.ids) - set(fit.ids)
+    if gone and _list_terms(fit):
+        # In the place of an effect a formula must be far better than beside it.
+        beside = replace(wide, given=frozenset(final.ids))
+        other, judged_beside = beside.name_all(beside.search_possible(final))
+        if find_cost(fit) > find_cost(other) - 2.0 * PRICE:
+            fit, judged, gone = other, judged_beside, set[str]()
+    named = [one for one in _list_terms(fit) if one.id in judged and not judged[one.id].refusal]
+    fall = find_cost(final) - find_cost(fit)
+    matrix = outcome.matrix
+    if not named or fall < EQUAL or any(-matrix.promise(one) > _SAME * fall for one in matrix.list_singles()):
         return outcome, None
-    least = min(cost for cost, *_ in better)
-    near = [(fit.numbers, cost, fit, without) for cost, fit, without in better if cost < least + EQUAL]
-    _, _, chosen, base = min(near, key=lambda one: one[:2])
-    if base is final and any(
-        one.gain > _SAME * (final.score - least) for one in outcome.screen.list_singles()
-    ):
-        return outcome, None
-    return replace(outcome, final=base), join_formula(_list_terms(chosen))
+    base = fit_path(search.path, final.state.drop(gone), noise=final.noise) if gone else final
+    return replace(outcome, final=base), join_formula(named)
 
 
 def _list_terms(fit: PathFit) -> list[FormulaEffect]:

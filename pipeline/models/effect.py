@@ -283,6 +283,10 @@ class Effect(ABC):
         """Start values of all parameters together."""
         return [dict(values) for values in self.starts]
 
+    def list_alike(self) -> list[Self]:
+        """Other values that make nearly the same motion: a fit that ended here may belong there."""
+        return []
+
     def list_usual(self, largest: Largest) -> dict[str, float]:
         """Typical values: a limit below the largest command, a change point in the middle of the run."""
         shares = {"": None, "duration": _USUAL_MOMENT}

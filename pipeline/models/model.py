@@ -145,10 +145,12 @@ class Timing:
     """Clock delays of one run, not part of the vehicle's physics.
 
     Attributes:
-        wheel_delay_s: delay of the measured wheel speeds [s].
+        wheel_delay_s: delay of the measured wheel speeds against the poses [s].
+        encoder_delay_s: the same against the commands [s].
     """
 
     wheel_delay_s: float = 0.0
+    encoder_delay_s: float = 0.0
 
 
 class JointDrive(DriveEffect):

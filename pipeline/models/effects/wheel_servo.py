@@ -55,6 +55,8 @@ _RIM_OF_STARTS = 5.0
 """Speed of the rim [m/s] of the Warthogs that have the values of the starts."""
 _OTHER_RIM = 1.5
 """Ratio of speeds of rims from which starts are scaled: a bound that never acts has no derivative."""
+_ALIKE_AT, _SLOPES = 3.0, (0.5, 0.7, 1.4, 2.0)
+"""Speed [m/s] at which other motors have the same force, and how fast theirs falls, by that of this one."""
 _TINY = 1e-6
 """Friction [m/s] that counts as none: a divisor."""
 _NO_COMMAND = 1e-6
@@ -71,6 +73,7 @@ class WheelServo(JointDrive):
     parameters = (
         replace(
             TIME_CONSTANT,
+            bounds=(_LEAST_TAU_S, 10.0),
             about="time constant straight ahead",
             typical=0.2,
             starts=(),
@@ -164,7 +167,7 @@ class WheelServo(JointDrive):
     )
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
-    contains = ("deadband", "load_droop", "drive_lag", "turn_lag", "difference_gain")
+    contains = ("deadband", "load_droop", "turn_lag", "difference_gain")
     companions = (
         "transport_delay",
         "body_turn_limit",
@@ -182,6 +185,16 @@ class WheelServo(JointDrive):
         factors = {p.name: {"m/s": share, "s/m": 1.0 / share}.get(p.unit, 1.0) for p in self.parameters}
         scaled = ({name: factors[name] * start[name] for name in start} for start in starts)
         return starts + [dict(self.change_within(**one).values) for one in scaled]
+
+    def list_alike(self) -> list[Self]:
+        """The same force near the speed of the starts by other motors: another valley, or the same one."""
+        bound, slope = self.values["bound"], self._slope
+        if not slope:
+            return []
+        forces = [(bound + (share - 1.0) * slope * _ALIKE_AT, share * slope) for share in _SLOPES]
+        return [
+            self.change_within(bound=force, no_load=force / fall) for force, fall in forces if force > 0.0
+        ]
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a lag: neither ground nor resistance loads it, and its force is never bounded."""

@@ -1,0 +1,372 @@
+"""The matrix of a model: what every set of effects near it would explain, to second order.
+
+Columns are the model's residual, what changes when each of its effects is taken out, the derivatives of its
+numbers, and what changes when each candidate is put in, at each of its starts: all as innovations of the
+noise that no candidate explains. The cost of any set is a quadratic form of their Gram matrix.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.candidates import PRICE, find_rarity, list_all_trials
+from pipeline.estimation.fit import invert, whiten_columns
+from pipeline.estimation.model_state import stack_columns
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Sequence
+
+    from pipeline.core import Floats, Ints
+    from pipeline.estimation.candidates import Candidate, Trial
+    from pipeline.estimation.fit import PathFit
+    from pipeline.estimation.model_state import ModelState
+    from pipeline.estimation.noise import Noise
+    from pipeline.models import Largest
+
+_INDEPENDENT = 0.02
+"""Share of a column that the others of its set must leave."""
+_RIDGE = 1e-6
+"""Regularization of the cost of a set, columns of unit size."""
+_SATURATED = 1e-3
+"""Regularization of the fit of all candidates at once, columns of unit size."""
+_PASSES = 2
+"""Times that the noise is learned from what no candidate explains."""
+_PAIRED = 16
+"""Candidates that are combined in pairs."""
+_BESIDE = 5
+"""Best single moves that are looked at beside the sets on the way to the best one."""
+_FALL = 1.0
+"""Fall of the cost that is worth a move."""
+_SHARES = (0.1, 2.0)
+"""Least and most of a start that a secant of one number may promise."""
+_CLAMPED = 4
+"""Rounds in which numbers are held to their bounds."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A set of effects, as what changes in a model.
+
+    Attributes:
+        gone: ids of effects that go.
+        added: places of the trials that come, in order.
+    """
+
+    gone: frozenset[str] = frozenset()
+    added: tuple[int, ...] = ()
+
+    def drop(self, *names: str) -> Change:
+        """The change with more effects gone."""
+        return Change(self.gone.union(names), self.added)
+
+    def add(self, *trials: int) -> Change:
+        """The change with more trials."""
+        return Change(self.gone, tuple(sorted((*self.added, *trials))))
+
+    def without(self, *trials: int) -> Change:
+        """The change without some trials."""
+        return Change(self.gone, tuple(one for one in self.added if one not in trials))
+
+
+class Matrix:
+    """What sets of effects near a model would explain.
+
+    Args:
+        fit: the model.
+        candidates: effects that could be added.
+        largest: reference of relative starts.
+
+    Attributes:
+        fit: the model with the noise of what no candidate explains. That of its own residuals takes a slow
+            hidden effect for a slow disturbance, and hides it.
+        trials: starts of the candidates.
+    """
+
+    def __init__(self, fit: PathFit, candidates: Sequence[Candidate], largest: Largest) -> None:
+        path, state = fit.path, fit.state
+        self.trials = list_all_trials(fit, candidates, largest)
+        drops = [path.find_residuals(state.drop([name])) - fit.residual for name in fit.ids]
+        columns = [fit.residual[:, :, None], *([stack_columns(drops)] if drops else []), fit.columns]
+        columns += [trial.columns for trial in self.trials]
+        places = np.split(np.arange(sum(map(_width, columns))), np.cumsum([*map(_width, columns)])[:-1])
+        self._places: list[Ints] = places[len(columns) - len(self.trials) :]
+        joined = np.concatenate(columns, axis=2)
+        self._first = 1 + len(drops)
+        self._dropped = {name: 1 + index for index, name in enumerate(fit.ids)}
+        self._own: dict[str, list[int]] = {}
+        for index in fit.smooth:
+            self._own.setdefault(fit.free[index].effect, []).append(index)
+        self.fit = self._learn_noise(fit, joined)
+        white = whiten_columns(self.fit, joined)
+        self._white: Floats = white / self._deviation
+        self._gram: Floats = self._white.T @ self._white
+        self._bounds = self._find_bounds()
+        self._costs: dict[Change, float] = {}
+
+    @property
+    def noise(self) -> Noise:
+        """The noise of what no candidate explains."""
+        return self.fit.noise
+
+    @cached_property
+    def _deviation(self) -> float:
+        return math.sqrt(max(float(np.mean(self.fit.white.residual**2)), 1e-6))
+
+    def _learn_noise(self, fit: PathFit, columns: Floats) -> PathFit:
+        chosen = [*range(self._first, self._first + len(fit.free)), *self._list_best_columns(fit, columns)]
+        for _ in range(_PASSES if len(chosen) > len(fit.free) else 0):
+            white = whiten_columns(fit, columns[:, :, chosen])
+            size = np.sqrt(np.einsum("ij,ij->j", white, white)) + 1e-12
+            normal = (white / size).T @ (white / size) + _SATURATED * np.eye(size.size)
+            step = np.linalg.solve(normal, (white / size).T @ fit.white.residual) / size
+            fit = replace(fit, noise=fit.path.learn(fit.residual - columns[:, :, chosen] @ step, fit.noise))
+        return fit
+
+    def _list_best_columns(self, fit: PathFit, columns: Floats) -> list[int]:
+        """Columns of the best start of each candidate, beside the model's numbers."""
+        white, residual = whiten_columns(fit, columns[:, :, self._first :]), fit.white.residual
+        count = len(fit.free)
+        if count:
+            basis = np.linalg.qr(white[:, :count] / (np.linalg.norm(white[:, :count], axis=0) + 1e-12))[0]
+            white, residual = white - basis @ (basis.T @ white), residual - basis @ (basis.T @ residual)
+        best: dict[str, tuple[float, Ints]] = {}
+        for trial, places in zip(self.trials, self._places, strict=True):
+            mine = white[:, places - self._first]
+            pull = mine.T @ residual
+            gain = float(pull @ invert(mine.T @ mine) @ pull)
+            if gain > best.get(trial.effect.id, (-math.inf,))[0]:
+                best[trial.effect.id] = gain, places
+        return [place for _, places in best.values() for place in places.tolist()]
+
+    def _find_bounds(self) -> tuple[Floats, Floats]:
+        """Least and largest step of each column's number, infinite where none is known, shape (2, q)."""
+        low, high = np.full(self._gram.shape[0], -math.inf), np.full(self._gram.shape[0], math.inf)
+        for index, number in enumerate(self.fit.free):
+            value, (least, most) = self.fit.state.get(number), number.bounds
+            if math.isinf(self.fit.state.neutral_of(number)):
+                # A limit acts by its inverse, which is what is linear.
+                below = value - value**2 / least if least > 0.0 else -math.inf
+                above = min(0.999 * value, value - value**2 / most if most > value else math.inf)
+            else:
+                below, above = min(least - value, 0.0), max(most - value, 0.0)
+            low[self._first + index], high[self._first + index] = below, above
+        for trial, places in zip(self.trials, self._places, strict=True):
+            for name, place in zip(trial.names, places.tolist(), strict=False):
+                parameter, value = trial.effect.parameter(name), trial.effect.values[name]
+                if math.isfinite(parameter.neutral):
+                    low[place], high[place] = (bound - value for bound in parameter.bounds)
+        return low, high
+
+    def name(self, change: Change) -> tuple[str, ...]:
+        """Ids of the effects of a set."""
+        stay = [name for name in self.fit.ids if name not in change.gone]
+        return tuple(sorted([*stay, *(self.trials[index].effect.id for index in change.added)]))
+
+    def _price(self, change: Change) -> float:
+        stay = [effect for effect in self.fit.state.effects if effect.id not in change.gone]
+        ids = {"", *(effect.id for effect in stay)}
+        numbers = sum(number.effect in ids for number in self.fit.free)
+        own = PRICE * numbers + sum(map(find_rarity, stay))
+        return own + sum(self.trials[index].price for index in change.added)
+
+    def measure(self, change: Change) -> float:
+        """Expected cost of a set with its price; infinite where it cannot be."""
+        if change not in self._costs:
+            self._costs[change] = self._solve(change)[0]
+        return self._costs[change]
+
+    def promise(self, change: Change) -> float:
+        """Expected change of the cost."""
+        return self.measure(change) - self.measure(Change())
+
+    def _list_columns(self, change: Change) -> Ints:
+        ids = ["", *(name for name in self.fit.ids if name not in change.gone)]
+        own = [self._first + index for name in ids for index in self._own.get(name, ())]
+        return np.array([*own, *(c for i in change.added for c in self._places[i].tolist())], dtype=np.int64)
+
+    def _aim(self, change: Change) -> Floats:
+        """What the columns of a set must explain: the residual with what goes taken out, shape (q,)."""
+        aim = np.zeros(self._gram.shape[0])
+        aim[[0, *(self._dropped[name] for name in change.gone)]] = 1.0
+        return aim
+
+    def _solve(self, change: Change) -> tuple[float, Floats]:
+        """Expected cost of a set, and the step of its columns."""
+        trials = [self.trials[index] for index in change.added]
+        if any(self._is_in(one, change) for one in trials):
+            return math.inf, np.zeros(0)
+        columns, aim = self._list_columns(change), self._aim(change)
+        pulled = self._gram @ aim
+        cost = float(aim @ pulled) + self._price(change)
+        if not columns.size:
+            return cost, np.zeros(0)
+        normal = self._gram[np.ix_(columns, columns)]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
+        normal, pull = normal / np.outer(size, size) + _RIDGE * np.eye(size.size), pulled[columns] / size
+        inverse = np.linalg.inv(normal)
+        new = sum(self._places[index].size for index in change.added)
+        if new and (1.0 / np.diag(inverse)[-new:]).min() < _INDEPENDENT:
+            return math.inf, np.zeros(0)
+        scaled = self._hold(normal, pull, inverse @ pull, columns, size)
+        step = scaled / size
+        for trial, own in zip(trials, self._split(step, change), strict=True):
+            if not trial.is_possible(own):
+                return math.inf, step
+        return cost - float(2.0 * scaled @ pull - scaled @ (normal @ scaled)), step
+
+    def _is_in(self, trial: Trial, change: Change) -> bool:
+        """Whether a trial contains what stays, or is a special case of what comes."""
+        ids = self.name(change)
+        others = (self.trials[index].effect for index in change.added)
+        return bool({*trial.effect.contains} & {*ids}) or any(
+            trial.effect.id in one.contains for one in others
+        )
+
+    def _hold(self, normal: Floats, pull: Floats, step: Floats, columns: Ints, size: Floats) -> Floats:
+        """The step with numbers held to their bounds, the others adapted."""
+        low, high = (bound[columns] * size for bound in self._bounds)
+        held, moved = np.zeros(size.size, dtype=bool), step
+        for _ in range(_CLAMPED):
+            out = ~held & ((moved < low - 1e-9) | (moved > high + 1e-9))
+            if not out.any():
+                break
+            held |= out
+            moved = np.clip(moved, low, high)
+            free = ~held
+            if free.any():
+                rest = pull[free] - normal[np.ix_(free, held)] @ moved[held]
+                moved[free] = np.linalg.solve(normal[np.ix_(free, free)], rest)
+        return np.clip(moved, low, high) if held.any() else moved
+
+    def _split(self, step: Floats, change: Change) -> Iterator[tuple[float, ...]]:
+        """The part of a step of each trial."""
+        begin = step.size - sum(self._places[index].size for index in change.added)
+        for index in change.added:
+            end = begin + self._places[index].size
+            yield tuple(step[begin:end].tolist())
+            begin = end
+
+    def list_states(self, change: Change) -> list[ModelState]:
+        """The set at its expected values; where a number acts by a secant, also at the whole and at half."""
+        step = self._solve(change)[1]
+        state = self.fit.state.drop(change.gone) if change.gone else self.fit.state
+        own = self._list_columns(Change(change.gone)) - self._first
+        state = state.move([self.fit.free[index] for index in own.tolist()], step[: own.size].tolist())
+        shares: list[dict[str, float]] = [{}, {}, {}]
+        for index, mine in zip(change.added, self._split(step, change), strict=True):
+            trial = self.trials[index]
+            state = trial.add_to(state, mine)
+            if trial.is_one_number:
+                for each, share in zip(
+                    shares, (min(max(mine[0], _SHARES[0]), _SHARES[1]), 1.0, 0.5), strict=True
+                ):
+                    each[trial.effect.id] = share
+        if not shares[0]:
+            return [state]
+        made = []
+        for each in shares:
+            weakened = state
+            for name, share in each.items():
+                weakened = weakened.weaken({name}, share)
+            made.append(weakened)
+        return made
+
+    @cached_property
+    def _leading(self) -> list[int]:
+        """The best start of each candidate, the best candidate first; impossible ones last."""
+        best: dict[str, int] = {}
+        for _, index in sorted(
+            (self.measure(Change().add(index)), index) for index in range(len(self.trials))
+        ):
+            best.setdefault(self.trials[index].effect.id, index)
+        return list(best.values())
+
+    def list_singles(self) -> list[Change]:
+        """The best start of each candidate that is possible, the best candidate first."""
+        singles = (Change().add(index) for index in self._leading)
+        return [one for one in singles if math.isfinite(self.measure(one))]
+
+    def list_replacements(self, name: str) -> list[Change]:
+        """The best start of each candidate in the place of an effect, the best candidate first."""
+        gone = Change().drop(name)
+        best: dict[str, Change] = {}
+        for _, index in sorted((self.measure(gone.add(index)), index) for index in range(len(self.trials))):
+            best.setdefault(self.trials[index].effect.id, gone.add(index))
+        return [one for one in best.values() if math.isfinite(self.measure(one))]
+
+    def choose(self, given: Collection[str], banned: Collection[tuple[str, ...]]) -> list[Change]:
+        """Sets that promise less cost, the best first: those on the way of steepest moves, and others near.
+
+        Args:
+            given: ids of effects that stay.
+            banned: names of sets that are not chosen.
+        """
+        start, now = self.measure(Change()), Change()
+        way, seen = list[Change](), {now}
+        while True:
+            moves = dict.fromkeys(self._list_moves(now, given))
+            seen.update(moves)
+            best = min(moves, key=self.measure, default=now)
+            if not self.measure(best) < self.measure(now) - _FALL:
+                break
+            now = best
+            way.append(now)
+        paying = sorted((one for one in seen if self.measure(one) < start - _FALL), key=self.measure)
+        single = [one for one in paying if len(one.gone) <= 1 and len(one.added) <= 1]
+        chosen: dict[tuple[str, ...], Change] = {}
+        for one in (*way, *self._pick(single)[:_BESIDE], *paying):
+            chosen.setdefault(self.name(one), one)
+        return [one for name, one in chosen.items() if name not in banned]
+
+    def _pick(self, changes: Iterable[Change]) -> list[Change]:
+        """The first of each set."""
+        first: dict[tuple[str, ...], Change] = {}
+        for one in changes:
+            first.setdefault(self.name(one), one)
+        return list(first.values())
+
+    def _list_moves(self, now: Change, given: Collection[str]) -> Iterator[Change]:
+        """What one move makes of a set: drop, add, another start, exchange, a pair, a whole for its parts."""
+        ids = [trial.effect.id for trial in self.trials]
+        stay = [name for name in self.fit.ids if name not in now.gone and name not in given]
+        have = {ids[index] for index in now.added}
+        new = [index for index, name in enumerate(ids) if name not in have]
+        for index in now.added:
+            rest = now.without(index)
+            yield rest
+            yield from (rest.add(other) for other in range(len(ids)) if ids[other] == ids[index])
+            yield from (rest.add(other) for other in new)
+        yield from (Change(now.gone - {name}, now.added) for name in now.gone)
+        yield from (now.add(index) for index in new)
+        for name in stay:
+            yield now.drop(name)
+            yield from (now.drop(name).add(index) for index in new)
+        for pair in combinations(self._leading[:_PAIRED], 2):
+            if not have & {ids[index] for index in pair}:
+                yield now.add(*pair)
+        for index in new:
+            effect = self.trials[index].effect
+            parts = [name for name in stay if name in effect.contains or name in effect.companions]
+            if len(parts) > 1:
+                yield now.drop(*parts).add(index)
+
+    def sum_blocks(self, change: Change) -> Floats:
+        """Expected cost of a set in each block, without price, shape (blocks,)."""
+        columns, aim = self._list_columns(change), self._aim(change)
+        aim[columns] -= self._solve(change)[1]
+        block = self.fit.path.block[self.fit.white.rows]
+        return np.asarray(np.bincount(block, (self._white @ aim) ** 2), dtype=np.float64)
+
+    def find_price(self, change: Change) -> float:
+        """What the numbers of a set must bring."""
+        return self._price(change)
+
+
+def _width(columns: Floats) -> int:
+    return int(columns.shape[2])
