@@ -264,7 +264,7 @@ class Search:
 
     def _look(self, matrix: Matrix, change: Change) -> tuple[float, tuple[str, ...], ModelState]:
         """What a set brings at first sight, at the best of its starts."""
-        looks = list[tuple[float, int, ModelState]]()
+        looks: list[tuple[float, int, ModelState]] = []
         for state in matrix.list_states(change):
             free = self.path.list_free(state)
             cost = measure_cost(self.path, matrix.noise, state, free, self.path.find_residuals(state))
