@@ -65,8 +65,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     From one run, or from several of one vehicle jointly: all that are given, or that a folder holds.
 
     Args:
-        budget: CPU time that a search may take, for example 60s (default: 60s for up to 10 minutes of
-            driving, more for longer runs); after it the best answer so far is given.
+        budget: CPU time that a search may take, for example 60s; after it the best answer so far is given. By
+            default it takes as long as it needs.
         everything: show all of the summary: where the error is, budget, limits, causes, ranges between runs.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
@@ -167,7 +167,7 @@ def diagnose_logs(
         options: of the analyses.
         known: model that is known; only effects beyond it are estimated.
         owner: whose geometry is used where vehicles differ.
-        budget_s: CPU time of a search [s]; None for the usual one.
+        budget_s: CPU time of a search [s]; None for as much as it needs.
         quiet: print no progress.
     """
     diagnosed.limit.at_work = logs[0]

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
         map_in_order,
         return_freed_memory,
         usable_threads,
-        usual_budget,
     )
     from pipeline.core.machine_code import (
         LANES,

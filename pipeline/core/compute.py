@@ -56,12 +56,6 @@ def return_freed_memory() -> None:
         trim(0)
 
 
-_USUAL_S = 60.0
-"""CPU time of a search [s] for `_FOR_S` of driving, and the least."""
-_FOR_S = 600.0
-"""Driving [s] that `_USUAL_S` is for."""
-
-
 @dataclass
 class Budget:
     """CPU time that a search may take; after it the best answer so far stands.
@@ -91,11 +85,6 @@ class Budget:
         """Report the effects identified on a part of the path."""
         if self.notify is not None:
             self.notify(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
-
-
-def usual_budget(driven_s: float) -> float:
-    """CPU time [s] for a run of so much driving [s]: a minute for ten minutes, and never less."""
-    return max(_USUAL_S, _USUAL_S * driven_s / _FOR_S)
 
 
 def usable_threads() -> int:

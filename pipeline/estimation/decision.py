@@ -57,6 +57,8 @@ _OFTEN = 0.1
 """Share of them in which others in its place must cost less, for the data not to decide between them."""
 _PROMISING = 0.5
 """Share of what an effect brings that others in its place may promise less, to be fitted."""
+_FAR = 4.0 * EQUAL
+"""How far behind their fits end."""
 _RIVALS = 3
 """Others that are fitted in the place of each effect."""
 _ROUNDS = 14
@@ -451,7 +453,7 @@ class Search:
             ]
             for change in others[:_RIVALS]:
                 _, _, state = self._look(matrix, change)
-                fit = fit_path(self.path, state, noise=final.noise)
+                fit = _fit_under(self.path, state, final.noise, _STEPS, find_cost(final) + _FAR)
                 (other,) = (matrix.trials[index].effect.id for index in change.added)
                 effect = fit.state.find(other)
                 if effect is None or not any(

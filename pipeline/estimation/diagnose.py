@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ from dataclasses import replace
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import Budget, usual_budget
+from pipeline.core import Budget
 from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, find_undecided, find_unobservable, read_clocks
 from pipeline.estimation.conclude import PathResult
@@ -61,7 +62,7 @@ def diagnose_runs(
         inputs: `command`, `measured` or both; with both, the command leads and the wheels separate the
             drivetrain from the ground.
         model: the known model, to which effects are added; the ideal model when None.
-        budget_s: CPU time limit of the search [s]; by default a minute for ten minutes of driving.
+        budget_s: CPU time limit of the search [s]; by default none, so that answers do not hang on the machine.
         notify: called with a progress message.
 
     Returns:
@@ -87,8 +88,7 @@ def diagnose_runs(
     def search(members: Sequence[Member], runs: Sequence[MotionRun]) -> Diagnosis:
         chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
         data = prepare_data(runs, vehicle, chosen.source)
-        driven = sum(run.duration_s for run in runs)
-        budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
+        budget = Budget(math.inf if budget_s is None else budget_s, notify)
         # With more threads, the order of summation would depend on the number of cores.
         with threadpool_limits(limits=1, user_api="blas"):
             results, clocks = _search_paths(data, chosen.source, known, budget)

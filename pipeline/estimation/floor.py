@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.core import Floats, robust_spreads
+from pipeline.core import FOLDS, Floats, robust_spreads
 from pipeline.estimation.evidence import regress
 from pipeline.estimation.held_out import score
 from pipeline.estimation.noise import find_weights
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from pipeline.estimation.path_residuals import PathResiduals
     from pipeline.estimation.run_residuals import RunResiduals
 
+_NEAREST = 25
+"""Nearest moments whose mean is taken."""
+_MOST_NEAR = 4000
+"""About how many moments are looked among: more take long, and are hardly nearer."""
+_INPUT_S = np.arange(0.0, 2.01, 0.1)
+_MOTION_S = (0.0, 0.1, 0.2, 0.4, 0.8)
+"""How long ago input and motion count [s]."""
 _ROUNDS = 2
 """Times that the noise is learned: of what a model leaves, and of what the regression leaves of that."""
 
@@ -31,10 +38,11 @@ _ROUNDS = 2
 def estimate_floor(data: EstimationData, state: ModelState | None = None) -> Errors:
     """The errors of a model that explains everything but noise and random motion.
 
-    A regression on the input of the last two seconds, the attitude, the heading and turned wheels
-    stands for the best model: the errors of a model are lowered by as much as it lowers the sums of
-    what that model leaves. Its numbers are as large as the data show beside the noise, so that it
-    explains no noise. The errors refer to measured wheels if all runs have them, else to the command.
+    Two rests stand for the best model: a regression on the input of the last two seconds, the attitude, the
+    heading and turned wheels, whose numbers are as large as the data show beside the noise; and the mean of
+    the moments in other stretches whose input and motion were nearest, which no form binds. The errors of a
+    model are lowered by as much as the better one lowers the sums of what that model leaves. They refer to
+    measured wheels if all runs have them, else to the command.
 
     Args:
         data: the runs.
@@ -42,13 +50,45 @@ def estimate_floor(data: EstimationData, state: ModelState | None = None) -> Err
     """
     path, state = data.paths[0], state or data.start_state()
     residual = path.find_residuals(state)
-    before, after = (_measure(path, one) for one in (residual, _explain_all(path, residual)))
+    rests = (residual, _explain_all(path, residual), _explain_near(path, state, residual))
+    before, *after = (_measure(path, one) for one in rests)
     errors = score(data if len(data.paths) == 1 else data.behind_wheels, state).pooled
     lowered: dict[str, Any] = {}
     for name, size in before.items():
-        value = np.multiply(getattr(errors, name), np.minimum(after[name] / np.maximum(size, 1e-12), 1.0))
+        least = np.minimum.reduce([size, *(one[name] for one in after)])
+        value = np.multiply(getattr(errors, name), least / np.maximum(size, 1e-12))
         lowered[name] = tuple(value.tolist()) if value.ndim else float(value)
     return replace(errors, **lowered)
+
+
+def _explain_near(path: PathResiduals, state: ModelState, residual: Floats) -> Floats:
+    """What the nearest moments of other blocks leave of increments (n, 3)."""
+    from scipy.spatial import KDTree  # noqa: PLC0415 - heavy
+
+    features = np.concatenate([_list_moments(path, state, run) for run in range(len(path.residuals_by_run))])
+    fold = np.random.default_rng(0).permutation(int(path.block.max()) + 1)[path.block] % FOLDS
+    rest = np.array(residual)
+    for number in range(FOLDS):
+        known, asked = np.flatnonzero(fold != number), fold == number
+        known = known[:: max(1, known.size // _MOST_NEAR)]
+        if not known.size or not asked.any():
+            continue
+        mean, spread = features[known].mean(axis=0), features[known].std(axis=0) + 1e-9
+        tree = KDTree((features[known] - mean) / spread)
+        _, near = tree.query((features[asked] - mean) / spread, k=range(1, min(_NEAREST, known.size) + 1))
+        rest[asked] -= residual[known][near].mean(axis=1)
+    return rest
+
+
+def _list_moments(path: PathResiduals, state: ModelState, run: int) -> Floats:
+    """Two seconds of the input and .8 s of the model's motion at every step of a run, shape (m, p)."""
+    one, middle = path.residuals_by_run[run], path.times[path.run == run].mean(axis=1)
+    effects = [effect for effect in state.effects_of(run) if path.owns(effect)]
+    ideal, moved = (one.predict_velocity(own, state.timing[run]) for own in ((), effects))
+    pairs = [(ideal, late) for late in _INPUT_S] + [(moved, late) for late in _MOTION_S]
+    signals = [(getattr(velocity, name), late) for velocity, late in pairs for name in ("x", "y", "w")]
+    columns = [np.interp(middle - late, one.grid.times, signal) for signal, late in signals]
+    return np.column_stack([column for column in columns if np.ptp(column) > 0.0])
 
 
 def _measure(path: PathResiduals, residual: Floats) -> dict[str, Floats]:

@@ -231,13 +231,19 @@ def carry_lengths(fit: PathFit, information: Floats) -> Floats:
 def _carry(fit: PathFit, information: Floats, change: Floats) -> Floats:
     """Variance of each number by one that the fit takes as given, shape (p,).
 
+    What a fit finds of a clock does not take over what remains unknown of it.
+
     Args:
         fit: the fit.
         information: on its numbers, shape (p, p).
         change: of the residuals by one standard error of what is given, shape (n, 3, 1).
     """
-    white = whiten_columns(fit, change)[:, 0]
-    return np.asarray((invert(information) @ (fit.white.columns.T @ white)) ** 2)
+    white, carried = whiten_columns(fit, change)[:, 0], np.zeros(len(fit.free))
+    own = [index for index, number in enumerate(fit.free) if number.effect]
+    if own:
+        pull = fit.white.columns[:, own].T @ white
+        carried[own] = (invert(information[np.ix_(own, own)]) @ pull) ** 2
+    return carried
 
 
 def narrow_path(fit: PathFit) -> tuple[Floats, Floats]:

@@ -39,6 +39,8 @@ HORIZONS_S = (0.5, 2.0, 10.0, math.inf)
 """Times [s] after which errors of predictions are compared; infinite for whole stretches without a gap."""
 CLOCK_STEP_S = 5e-3
 """Step of a derivative by the delay of a clock [s]: a quarter of a cell."""
+_WITHIN_CELL = 0.05
+"""Standard error of a time constant in cells: drawn lags are found within a tenth of a cell."""
 _MOST_PERIODS = 2.0
 """Largest delay of encoders against the commands, in their periods."""
 _NO_DELAY = Timing()
@@ -111,11 +113,7 @@ class PathResiduals(ABC):
 
     def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
         """Free numbers of a state: clocks and those of `per_run` have a value in each run."""
-        return tuple(
-            number
-            for number in state.list_free(self.delays, (*self.clocks, *per_run), self.grounds)
-            if number.effect or not self.dates_poses or self.residuals_by_run[number.runs[0]].has_gyro
-        )
+        return state.list_free(self.delays, (*self.clocks, *per_run), self.grounds)
 
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
@@ -146,7 +144,7 @@ class PathResiduals(ABC):
 
     @abstractmethod
     def list_clock_errors(self) -> Floats:
-        """Standard error of each run's clock that is fixed in this path [s], shape (runs,)."""
+        """Standard error of each run's clock beside what a fit finds of it [s], shape (runs,)."""
 
     @abstractmethod
     def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
@@ -284,6 +282,11 @@ class BodyResiduals(PathResiduals):
         """All effects if the input is the command; those after the wheels if it is the wheels."""
         return self.whole or effect.place > Place.DRIVE
 
+    def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """See `PathResiduals`; a gyro tells the delay of the encoders."""
+        free = super().list_free(state, per_run)
+        return tuple(one for one in free if one.effect or self.residuals_by_run[one.runs[0]].has_gyro)
+
     def find_velocities(self, state: ModelState, run: int) -> Floats:
         """See `PathResiduals`."""
         return self.residuals_by_run[run].find_residuals(state.effects_of(run), state.timing[run])
@@ -371,11 +374,7 @@ class WheelResiduals(PathResiduals):
 
     def find_velocities(self, state: ModelState, run: int) -> Floats:
         """See `PathResiduals`; in terms of the ideal velocity of the wheels."""
-        return self._compare(state, run, state.timing[run].encoder_delay_s)
-
-    def _compare(self, state: ModelState, run: int, late: float) -> Floats:
-        """Velocities with the encoders delayed by ``late`` [s]."""
-        run_residuals = self.residuals_by_run[run]
+        run_residuals, late = self.residuals_by_run[run], state.timing[run].encoder_delay_s
         if (run, late) not in self._seen:
             wheels = self.measured[run].predict_velocity((), Timing(late))
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
@@ -386,10 +385,14 @@ class WheelResiduals(PathResiduals):
         return apart
 
     def list_clock_errors(self) -> Floats:
-        """See `PathResiduals`: wheels read periodically change at an unknown time between two readings."""
-        return (
-            np.array([run_residuals.run.wheel_period_s for run_residuals in self.residuals_by_run]) / _UNIFORM
-        )
+        """See `PathResiduals`: when within a cell an encoder was read is not known."""
+        return np.array([_WITHIN_CELL * one.grid.step_s for one in self.residuals_by_run])
+
+    def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
+        """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
+        timing = list(state.timing)
+        timing[run] = replace(timing[run], encoder_delay_s=timing[run].encoder_delay_s + late_s)
+        return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
 
     def list_rolled(self, state: ModelState) -> tuple[Floats, float]:
         """See `PathResiduals`: the measured wheels, which body commands are compared with."""
@@ -399,10 +402,6 @@ class WheelResiduals(PathResiduals):
         ]
         is_body = all(one.run.alignment.body_multiplier is not None for one in self.residuals_by_run)
         return self._average(seen), 1.0 if is_body else 0.0
-
-    def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
-        """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
-        return self._multiply(self._compare(state, run, state.timing[run].encoder_delay_s + late_s), run)
 
 
 def _group_by_ground(residuals_by_run: Sequence[RunResiduals]) -> tuple[tuple[int, ...], ...]:
