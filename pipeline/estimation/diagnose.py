@@ -62,7 +62,7 @@ def diagnose_runs(
         inputs: `command`, `measured` or both; with both, the command leads and the wheels separate the
             drivetrain from the ground.
         model: the known model, to which effects are added; the ideal model when None.
-        budget_s: CPU time limit of the search [s]; by default none, so that answers do not hang on the machine.
+        budget_s: CPU time limit of the search [s]; by default none: answers do not hang on it.
         notify: called with a progress message.
 
     Returns:

@@ -231,7 +231,7 @@ def carry_lengths(fit: PathFit, information: Floats) -> Floats:
 def _carry(fit: PathFit, information: Floats, change: Floats) -> Floats:
     """Variance of each number by one that the fit takes as given, shape (p,).
 
-    What a fit finds of a clock does not take over what remains unknown of it.
+    A delay of encoders that is fitted does not take over what remains unknown of it.
 
     Args:
         fit: the fit.
@@ -239,10 +239,10 @@ def _carry(fit: PathFit, information: Floats, change: Floats) -> Floats:
         change: of the residuals by one standard error of what is given, shape (n, 3, 1).
     """
     white, carried = whiten_columns(fit, change)[:, 0], np.zeros(len(fit.free))
-    own = [index for index, number in enumerate(fit.free) if number.effect]
-    if own:
-        pull = fit.white.columns[:, own].T @ white
-        carried[own] = (invert(information[np.ix_(own, own)]) @ pull) ** 2
+    moved = [index for index, number in enumerate(fit.free) if number.effect or fit.path.dates_poses]
+    if moved:
+        pull = fit.white.columns[:, moved].T @ white
+        carried[moved] = (invert(information[np.ix_(moved, moved)]) @ pull) ** 2
     return carried
 
 

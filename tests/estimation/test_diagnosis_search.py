@@ -180,5 +180,5 @@ def test_an_effect_that_acts_beside_another_one_alone_is_no_candidate_without_it
     search = Search(data.paths[1], data.list_drivetrain(), data.conditions)
     fit = fit_path(search.path, data.start_state([_give("drive_lag", 0.4)]))
     assert "motor_imbalance" in {one.id for one in search.candidates}
-    assert "motor_imbalance" not in {trial.effect.id for trial in search.screen(fit).trials}
+    assert "motor_imbalance" not in {trial.effect.id for trial in search.make_matrix(fit).trials}
     assert find_effect("motor_imbalance")().acts_in(("wheel_servo",))
