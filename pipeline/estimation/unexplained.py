@@ -56,11 +56,11 @@ def search_formula(
     fit, judged = wide.name_all(wide.search_possible(final))
     gone = set(final.ids) - set(fit.ids)
     if gone and _list_terms(fit):
-        # In the place of an effect a formula must be far better than beside it.
-        beside = replace(wide, given=frozenset(final.ids))
-        other, judged_beside = beside.name_all(beside.search_possible(final))
+        # In the place of an effect a formula must be far better than beside it, unless it makes it needless.
+        beside = replace(wide, given=frozenset(final.ids)).search_possible(final)
+        other, judged_beside = wide.name_all(beside)
         if find_cost(fit) > find_cost(other) - 2.0 * PRICE:
-            fit, judged, gone = other, judged_beside, set[str]()
+            fit, judged, gone = other, judged_beside, set(final.ids) - set(other.ids)
     named = [one for one in _list_terms(fit) if one.id in judged and not judged[one.id].refusal]
     fall = find_cost(final) - find_cost(fit)
     matrix = outcome.matrix
