@@ -17,7 +17,16 @@ import numpy as np
 
 from pipeline.core import NORMAL_95, Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, find_rarity, list_starts
-from pipeline.estimation.fit import PathFit, begin_fit, fit_path, fit_roughly, invert, measure_cost, whiten
+from pipeline.estimation.fit import (
+    PathFit,
+    begin_fit,
+    fit_path,
+    fit_roughly,
+    go_on,
+    invert,
+    measure_cost,
+    whiten,
+)
 from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.matrix import Change, Matrix
 from pipeline.estimation.model_state import combine_columns, pick_columns
@@ -67,7 +76,7 @@ _LOOKED, _LOOKS = 12, 2
 """Sets that are looked at together, and how often where none of them is better."""
 _FITTED, _NEAR = 3, 0.3
 """Most of them that are fitted, and the share of what the best one brings at first sight that others must."""
-_STEPS, _FEW_STEPS, _HARD_STEPS = 8, 4, 6
+_STEPS, _FEW_STEPS, _HARD_STEPS = 8, 3, 6
 """Steps of a fit with the noise as it is: of a set, of the model before, of a whole in its parts' place."""
 _ANOTHER_STEPS = 5
 """The same from another start of an effect."""
@@ -239,7 +248,7 @@ class Search:
             if better is None:
                 break
             current = better
-        return self._simplify(fit_path(self.path, current.state, noise=current.noise))
+        return self._simplify(go_on(current))
 
     def _improve(self, current: PathFit) -> PathFit | None:
         """The cheapest of the sets that promise most; None where none is cheaper."""
@@ -255,7 +264,8 @@ class Search:
             for brings, _, state in looked[:_FITTED]:
                 if best is not None and not brings < _NEAR * looked[0][0]:
                     break
-                fit = _fit_under(self.path, state, noise, _STEPS, find_cost(base))
+                least = find_cost(base) + (0.0 if best is None else min(best[0], 0.0))
+                fit = _fit_under(self.path, state, noise, _STEPS, least)
                 fall = find_cost(fit) - find_cost(base)
                 fit = replace(fit, noise=self.path.learn(fit.residual, noise))
                 if find_cost(fit) < find_cost(learned) and (best is None or fall < best[0]):
@@ -296,7 +306,7 @@ class Search:
 
     def _take(self, start: PathFit, current: PathFit, least: float) -> PathFit | None:
         """A model fitted with its own noise, where it is cheaper by so much."""
-        fit = fit_path(self.path, start.state)
+        fit = go_on(start)
         return fit if find_cost(fit) < find_cost(current) - least else None
 
     def _try_wholes(self, current: PathFit) -> PathFit | None:
@@ -462,7 +472,8 @@ class Search:
                     continue
                 behind = _sum_blocks(fit, final.noise) - own
                 price = _find_price(fit.state, fit.numbers) - _find_price(final.state, final.numbers)
-                if float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN:
+                is_often = float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN
+                if is_often and find_cost(fit) < find_cost(final) + _FAR:
                     yield Rival(name, other, fit, find_cost(fit) - find_cost(final))
 
 

@@ -240,9 +240,19 @@ def fit_path(
     """
     fit = _begin(path, start, per_run)
     fit = replace(fit, noise=path.learn(fit.residual, noise, exact=exact))
+    return _fit_to_the_end(_differentiate(fit), exact=exact)
+
+
+def go_on(fit: PathFit) -> PathFit:
+    """A rough fit taken to its end, with the noise of its own residuals."""
+    learned = replace(fit, noise=fit.path.learn(fit.residual, fit.noise))
+    return _fit_to_the_end(_differentiate(learned, fit.widths), exact=False)
+
+
+def _fit_to_the_end(fit: PathFit, *, exact: bool) -> PathFit:
     if not fit.free:
         return fit
-    fit = _descend(_differentiate(fit), exact=exact)
+    fit = _descend(fit, exact=exact)
     for _ in range(_MOST_WALKS if len(fit.smooth) < len(fit.free) else 0):
         before = fit.score
         fit = _walk_grids(fit, exact=exact)
