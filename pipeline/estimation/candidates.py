@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -84,12 +84,15 @@ class Trial:
         columns: change of the prediction, shape (n, 3, k); the last one is that from the model to a start
             that is not neutral.
         own: start values of a clock of each run, whose columns are secants.
+        replaces: ids of effects of the model that are special cases of it. They are gone where it comes: its
+            last column is the way from the model with them to the model with it in their place.
     """
 
     effect: Effect
     names: tuple[str, ...]
     columns: Floats = field(repr=False)
     own: tuple[float, ...] = ()
+    replaces: frozenset[str] = frozenset()
 
     @property
     def numbers(self) -> int:
@@ -108,7 +111,8 @@ class Trial:
     def is_one_number(self) -> bool:
         """Whether it is a secant of one number, a share of which may be what the data ask for."""
         acting = self.effect.list_acting()
-        return not self.names and not self.own and [p.search for p in acting] == [Search.STARTS]
+        is_secant = not self.names and not self.own and not self.replaces
+        return is_secant and [p.search for p in acting] == [Search.STARTS]
 
     def add_to(self, state: ModelState, step: Sequence[float]) -> ModelState:
         """The state with the effect, its linear numbers moved by a step of the columns."""
@@ -122,7 +126,7 @@ class Trial:
 
     def is_possible(self, step: Sequence[float]) -> bool:
         """Whether the data ask for the effect, and not for its opposite where that has no meaning."""
-        if self.own:
+        if self.own or (self.replaces and not self.names):
             return True
         if not self.names:
             values = self.effect.values
@@ -173,7 +177,7 @@ def _leave_out_silent(fit: PathFit, trial: Trial) -> Trial | None:
     silent = [name for name, is_loud in zip(trial.names, loud.tolist(), strict=True) if not is_loud]
     names = tuple(name for name in trial.names if name not in silent)
     keep = [*np.flatnonzero(loud).tolist(), *range(count, trial.columns.shape[2])]
-    return Trial(trial.effect.fix(*silent), names, trial.columns[:, :, keep])
+    return replace(trial, effect=trial.effect.fix(*silent), names=names, columns=trial.columns[:, :, keep])
 
 
 def list_trials(fit: PathFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
@@ -191,17 +195,48 @@ def list_trials(fit: PathFit, candidate: Candidate, largest: Largest) -> Iterato
         }
         for start in starts
     ]
+    replaces = frozenset(candidate().contains).intersection(fit.ids)
+    state = fit.state.drop(replaces) if replaces else fit.state
     looked = [one for start, direct in zip(starts, changed, strict=True) for one in (start, *direct.values())]
-    path.look_ahead([fit.state.add(one) for one in looked if not one.is_neutral])
+    path.look_ahead([state.add(one) for one in looked if not one.is_neutral])
     for start, direct in zip(starts, changed, strict=True):
-        is_same = direct and start.is_neutral
-        base = fit.residual if is_same else path.find_residuals(fit.state.add(start))
+        is_same = direct and start.is_neutral and not replaces
+        base = fit.residual if is_same else path.find_residuals(state.add(start))
         columns = [
-            (base - path.find_residuals(fit.state.add(one))) / start.parameter(name).step
+            (base - path.find_residuals(state.add(one))) / start.parameter(name).step
             for name, one in direct.items()
         ]
         columns += [] if is_same else [fit.residual - base]
-        yield Trial(start, tuple(direct), stack_columns(columns))
+        yield Trial(start, tuple(direct), stack_columns(columns), replaces=replaces)
+    parts = [effect for effect in fit.state.effects if effect.id in replaces]
+    if (values := inherit(candidate.parameters, parts)) and not any(map(fit.state.has_own, replaces)):
+        yield _start_at_parts(fit, candidate(**values), state, replaces)
+
+
+def inherit(parameters: Sequence[Parameter], parts: Sequence[Effect]) -> dict[str, float]:
+    """Values at which an effect does what its special cases do: those of equal names, and time constants."""
+    values: dict[str, float] = {}
+    for part in parts:
+        is_lag = {*part.values} == {"tau"}
+        for p in parameters:
+            name = "tau" if is_lag and p.name.startswith("tau") else p.name
+            if math.isfinite(part.values.get(name, math.nan)):
+                values[p.name] = part.values[name]
+    return values
+
+
+def _start_at_parts(fit: PathFit, start: Effect, state: ModelState, replaces: frozenset[str]) -> Trial:
+    """An effect in the place of its special cases, begun at their values, with the derivatives there."""
+    path, base = fit.path, state.add(start)
+    residual = path.find_residuals(base)
+    free = [one for one in path.list_free(base) if one.effect == start.id and one.is_smooth and not one.runs]
+    columns = path.differentiate(base, residual, free)
+    return Trial(
+        start,
+        tuple(one.name for one in free),
+        np.concatenate((columns, (fit.residual - residual)[:, :, None]), axis=2),
+        replaces=replaces,
+    )
 
 
 def _start_clocks(fit: PathFit, candidate: Candidate, largest: Largest) -> Trial:

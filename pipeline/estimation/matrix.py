@@ -96,6 +96,10 @@ class Matrix:
         columns += [trial.columns for trial in self.trials]
         places = np.split(np.arange(sum(map(_width, columns))), np.cumsum([*map(_width, columns)])[:-1])
         self._places: list[Ints] = places[len(columns) - len(self.trials) :]
+        # What takes the place of special cases does so wholly: its last column is no number.
+        self._moved = [
+            at[:-1] if one.replaces else at for one, at in zip(self.trials, self._places, strict=True)
+        ]
         joined = np.concatenate(columns, axis=2)
         self._first = 1 + len(drops)
         self._dropped = {name: 1 + index for index, name in enumerate(fit.ids)}
@@ -163,6 +167,10 @@ class Matrix:
                     low[place], high[place] = (bound - value for bound in parameter.bounds)
         return low, high
 
+    def add(self, *trials: int, to: Change = Change()) -> Change:
+        """A set with trials, in the place of what they replace."""
+        return to.drop(*(name for index in trials for name in self.trials[index].replaces)).add(*trials)
+
     def name(self, change: Change) -> tuple[str, ...]:
         """Ids of the effects of a set."""
         stay = [name for name in self.fit.ids if name not in change.gone]
@@ -188,12 +196,15 @@ class Matrix:
     def _list_columns(self, change: Change) -> Ints:
         ids = ["", *(name for name in self.fit.ids if name not in change.gone)]
         own = [self._first + index for name in ids for index in self._own.get(name, ())]
-        return np.array([*own, *(c for i in change.added for c in self._places[i].tolist())], dtype=np.int64)
+        return np.array([*own, *(c for i in change.added for c in self._moved[i].tolist())], dtype=np.int64)
 
     def _aim(self, change: Change) -> Floats:
         """What the columns of a set must explain: the residual with what goes taken out, shape (q,)."""
         aim = np.zeros(self._gram.shape[0])
-        aim[[0, *(self._dropped[name] for name in change.gone)]] = 1.0
+        whole = [index for index in change.added if self.trials[index].replaces]
+        gone = change.gone.difference(*(self.trials[index].replaces for index in whole))
+        aim[[0, *(self._dropped[name] for name in gone)]] = 1.0
+        aim[[int(self._places[index][-1]) for index in whole]] = -1.0
         return aim
 
     def _solve(self, change: Change) -> tuple[float, Floats]:
@@ -210,7 +221,7 @@ class Matrix:
         size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
         normal, pull = normal / np.outer(size, size) + _RIDGE * np.eye(size.size), pulled[columns] / size
         inverse = np.linalg.inv(normal)
-        new = sum(self._places[index].size for index in change.added)
+        new = sum(self._moved[index].size for index in change.added)
         if new and (1.0 / np.diag(inverse)[-new:]).min() < _INDEPENDENT:
             return math.inf, np.zeros(0)
         scaled = self._hold(normal, pull, inverse @ pull, columns, size)
@@ -246,9 +257,9 @@ class Matrix:
 
     def _split(self, step: Floats, change: Change) -> Iterator[tuple[float, ...]]:
         """The part of a step of each trial."""
-        begin = step.size - sum(self._places[index].size for index in change.added)
+        begin = step.size - sum(self._moved[index].size for index in change.added)
         for index in change.added:
-            end = begin + self._places[index].size
+            end = begin + self._moved[index].size
             yield tuple(step[begin:end].tolist())
             begin = end
 
@@ -289,15 +300,15 @@ class Matrix:
 
     def list_singles(self) -> list[Change]:
         """The best start of each candidate that is possible, the best candidate first."""
-        singles = (Change().add(index) for index in self._leading)
+        singles = (self.add(index) for index in self._leading)
         return [one for one in singles if math.isfinite(self.measure(one))]
 
     def list_replacements(self, name: str) -> list[Change]:
         """The best start of each candidate in the place of an effect, the best candidate first."""
-        gone = Change().drop(name)
         best: dict[str, Change] = {}
-        for _, index in sorted((self.measure(gone.add(index)), index) for index in range(len(self.trials))):
-            best.setdefault(self.trials[index].effect.id, gone.add(index))
+        changes = [self.add(index, to=Change().drop(name)) for index in range(len(self.trials))]
+        for one in sorted(changes, key=self.measure):
+            best.setdefault(self.trials[one.added[0]].effect.id, one)
         return [one for one in best.values() if math.isfinite(self.measure(one))]
 
     def choose(self, given: Collection[str], banned: Collection[tuple[str, ...]]) -> list[Change]:
@@ -335,26 +346,26 @@ class Matrix:
         """What one move makes of a set: drop, add, another start, exchange, a pair, a whole for its parts."""
         ids = [trial.effect.id for trial in self.trials]
         stay = [name for name in self.fit.ids if name not in now.gone and name not in given]
-        have = {ids[index] for index in now.added}
-        new = [index for index, name in enumerate(ids) if name not in have]
+        have, free = {ids[index] for index in now.added}, {*self.fit.ids}.difference(given)
+        new = [i for i, one in enumerate(self.trials) if ids[i] not in have and one.replaces <= free]
         for index in now.added:
             rest = now.without(index)
             yield rest
-            yield from (rest.add(other) for other in range(len(ids)) if ids[other] == ids[index])
-            yield from (rest.add(other) for other in new)
+            yield from (self.add(other, to=rest) for other in range(len(ids)) if ids[other] == ids[index])
+            yield from (self.add(other, to=rest) for other in new)
         yield from (Change(now.gone - {name}, now.added) for name in now.gone)
-        yield from (now.add(index) for index in new)
+        yield from (self.add(index, to=now) for index in new)
         for name in stay:
             yield now.drop(name)
-            yield from (now.drop(name).add(index) for index in new)
+            yield from (self.add(index, to=now.drop(name)) for index in new)
         for pair in combinations(self._leading[:_PAIRED], 2):
             if not have & {ids[index] for index in pair}:
-                yield now.add(*pair)
+                yield self.add(*pair, to=now)
         for index in new:
             effect = self.trials[index].effect
             parts = [name for name in stay if name in effect.contains or name in effect.companions]
             if len(parts) > 1:
-                yield now.drop(*parts).add(index)
+                yield self.add(index, to=now.drop(*parts))
 
     def sum_blocks(self, change: Change) -> Floats:
         """Expected cost of a set in each block, without price, shape (blocks,)."""
