@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.ladder import ModelAssessment
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.estimation.model_state import ModelState
 
 DETECTED = LEAST_T + 1.3
 """Size of an effect [standard errors] that is named in nine of ten logs."""
@@ -96,8 +95,9 @@ class Clocks:
         ]
 
 
-def read_clocks(data: EstimationData, state: ModelState, source: Input) -> Clocks:
+def read_clocks(data: EstimationData, outcome: SearchResult, source: Input) -> Clocks:
     """Identify clock effects: with a gyro the delays of heading and position are known separately."""
+    state = outcome.final.state
     extra = find_late(state.effects, Late.POSES)
     rows, positions, skews, certain = [], [], [], []
     for number, (timing, run) in enumerate(zip(state.timing, data.runs, strict=True)):
@@ -123,7 +123,8 @@ def read_clocks(data: EstimationData, state: ModelState, source: Input) -> Clock
     if skewed:
         late_effects.append(find_late_effect(Late.HEADING).of_delay(-heading_delay))
     least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
-    known = extra is not None if not data.has_gyro else any(certain)
+    is_named = extra is not None and extra.id in {*outcome.new, *outcome.start.ids}
+    known = any(certain) if data.has_gyro else is_named
     if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
         if data.has_gyro and not data.largest.moves_both_ways:

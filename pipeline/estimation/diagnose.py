@@ -115,7 +115,7 @@ def _search_paths(
         candidates, given = data.list_drivetrain(), frozenset(e.id for e in driven)
         search = Search(data.paths[1], candidates, data.conditions, given, budget)
         results.append(_search_path(data, search, "wheels", ModelState((), state.timing).add(*driven)))
-    return results, read_clocks(data, state, body_input)
+    return results, read_clocks(data, body.outcome, body_input)
 
 
 def _search_path(data: EstimationData, search: Search, name: str, start: ModelState) -> PathResult:

@@ -343,7 +343,7 @@ class Matrix:
         return list(first.values())
 
     def _list_moves(self, now: Change, given: Collection[str]) -> Iterator[Change]:
-        """What one move makes of a set: drop, add, another start, exchange, a pair, a whole for its parts."""
+        """What one move makes of a set: drop, add, exchange, one for two, two, a whole for its parts."""
         ids = [trial.effect.id for trial in self.trials]
         stay = [name for name in self.fit.ids if name not in now.gone and name not in given]
         have, free = {ids[index] for index in now.added}, {*self.fit.ids}.difference(given)
@@ -358,6 +358,8 @@ class Matrix:
         for name in stay:
             yield now.drop(name)
             yield from (self.add(index, to=now.drop(name)) for index in new)
+        for pair in combinations(stay, 2):
+            yield from (self.add(index, to=now.drop(*pair)) for index in new)
         for pair in combinations(self._leading[:_PAIRED], 2):
             if not have & {ids[index] for index in pair}:
                 yield self.add(*pair, to=now)

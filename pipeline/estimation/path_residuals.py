@@ -115,6 +115,15 @@ class PathResiduals(ABC):
         """Free numbers of a state: clocks and those of `per_run` have a value in each run."""
         return state.list_free(self.delays, (*self.clocks, *per_run), self.grounds)
 
+    def _bound_delay(self, number: Free, most: float = math.inf) -> Free:
+        """A delay of encoders with its bounds, the largest in their periods.
+
+        A jump right after a reading seems to begin with it: up to half a period too early.
+        """
+        period = self.residuals_by_run[number.runs[0]].run.wheel_period_s
+        low, high = number.bounds
+        return replace(number, bounds=(low - 0.5 * period, max(min(high, most * period), CLOCK_STEP_S)))
+
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
         """Whether an effect acts on this path."""
@@ -285,7 +294,11 @@ class BodyResiduals(PathResiduals):
     def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
         """See `PathResiduals`; a gyro tells the delay of the encoders."""
         free = super().list_free(state, per_run)
-        return tuple(one for one in free if one.effect or self.residuals_by_run[one.runs[0]].has_gyro)
+        return tuple(
+            one if one.effect else self._bound_delay(one)
+            for one in free
+            if one.effect or self.residuals_by_run[one.runs[0]].has_gyro
+        )
 
     def find_velocities(self, state: ModelState, run: int) -> Floats:
         """See `PathResiduals`."""
@@ -364,8 +377,7 @@ class WheelResiduals(PathResiduals):
     def _bound(self, state: ModelState, number: Free) -> Free:
         if not number.effect:
             # What encoders report is a period old, or two where another one sends it on.
-            most = _MOST_PERIODS * self.residuals_by_run[number.runs[0]].run.wheel_period_s
-            return replace(number, bounds=(0.0, max(most, CLOCK_STEP_S)))
+            return self._bound_delay(number, _MOST_PERIODS)
         effect = state.find(number.effect)
         of = "" if effect is None else effect.parameter(number.name).relative_to
         low, high = number.bounds

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.estimation.candidates import PRICE, SHAPES
+from pipeline.estimation.candidates import SHAPES
 from pipeline.estimation.decision import EQUAL, LEAST_T, Search, SearchResult, find_cost
 from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.fit import fit_path
@@ -54,13 +54,11 @@ def search_formula(
     final, terms = outcome.final, list_terms(sideways=sideways, wheels=wheels)
     wide = replace(search, candidates=terms, least_t=math.sqrt(LEAST_T**2 + 2.0 * math.log(SHAPES)))
     fit, judged = wide.name_all(wide.search_possible(final))
+    if _list_terms(fit) and len(fit.ids) > len(_list_terms(fit)) + len(search.given):
+        # What an effect and a term say together, another term may say alone.
+        other = wide.name_all(wide.search_possible(outcome.start))
+        fit, judged = min((other, (fit, judged)), key=lambda one: find_cost(one[0]))
     gone = set(final.ids) - set(fit.ids)
-    if gone and _list_terms(fit):
-        # In the place of an effect a formula must be far better than beside it, unless it makes it needless.
-        beside = replace(wide, given=frozenset(final.ids)).search_possible(final)
-        other, judged_beside = wide.name_all(beside)
-        if find_cost(fit) > find_cost(other) - 2.0 * PRICE:
-            fit, judged, gone = other, judged_beside, set(final.ids) - set(other.ids)
     named = [one for one in _list_terms(fit) if one.id in judged and not judged[one.id].refusal]
     fall = find_cost(final) - find_cost(fit)
     matrix = outcome.matrix
