@@ -493,7 +493,7 @@ class Scene:
     def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
         if not lines:
             return None
-        parts, drawn, total, ends = [], 0, 0, []
+        parts, drawn, total, ends = [], 0, 0, list[float]()
         for frame, column, series in lines:
             # Constant stretches are thinned first, so that a held command keeps its edges.
             line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")

@@ -9,11 +9,12 @@ import os
 import subprocess
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -27,9 +28,6 @@ SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 Channel = dict[str, object]
 
 _TYPES = {"Q": "quantitative", "N": "nominal"}
-
-# The second end of a span has the type of the first.
-_ENDS = frozenset({"x2", "y2"})
 
 
 def encode_column(name: str, **look: object) -> Channel:
@@ -45,26 +43,16 @@ def encode_column(name: str, **look: object) -> Channel:
     return {**what, "type": _TYPES[kind], **look}
 
 
-@dataclass(frozen=True)
-class Chart:
-    """Vega-Lite chart: one mark over named rows, or several charts.
+class Chart(dict[str, Any]):
+    """Vega-Lite specification of one mark over named rows, or of several charts.
 
     Every call returns a new chart; nothing is validated or deep-copied.
-
-    Attributes:
-        view: properties other than encoding and transforms.
-        encoding: channels of the mark.
-        transforms: transforms of the rows.
     """
-
-    view: Mapping[str, object]
-    encoding: Mapping[str, object] = field(default_factory=dict)
-    transforms: tuple[Mapping[str, object], ...] = ()
 
     @classmethod
     def of_rows(cls, name: str) -> Chart:
         """Chart of the rows of that name, without a mark."""
-        return cls({"data": {"name": name}})
+        return cls(data={"name": name})
 
     def mark(self, kind: str, **look: object) -> Chart:
         """Draw the rows as `line`, `point`, `rule`, ..."""
@@ -73,51 +61,34 @@ class Chart:
     def encode(self, **channels: object) -> Chart:
         """Set channels: a column as for `encode_column` or by its name, several columns, or a value."""
         named = {name: _complete(name, value) for name, value in channels.items()}
-        return replace(self, encoding={**self.encoding, **named})
+        return self.properties(encoding={**self.get("encoding", {}), **named})
 
     def filter(self, predicate: str) -> Chart:
         """Select the rows for which the expression is true."""
-        return self._transform({"filter": predicate})
-
-    def calculate(self, name: str, expression: str) -> Chart:
-        """Add a computed column."""
-        return self._transform({"calculate": expression, "as": name})
-
-    def _transform(self, step: Mapping[str, object]) -> Chart:
-        return replace(self, transforms=(*self.transforms, step))
+        return self.properties(transform=[{"filter": predicate}])
 
     def properties(self, **given: object) -> Chart:
         """Set width, height, title, usermeta, ..."""
-        return replace(self, view={**self.view, **given})
-
-    def resolve_scale(self, **channels: str) -> Chart:
-        """Set which scales the parts do not share."""
-        return self.properties(resolve={"scale": channels})
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the specification."""
-        view: dict[str, object] = {"encoding": dict(self.encoding)} if self.encoding else {}
-        if self.transforms:
-            view["transform"] = list(self.transforms)
-        return {**self.view, **view}
+        return Chart({**self, **given})
 
 
 def layer(*charts: Chart) -> Chart:
     """Overlay charts."""
-    return Chart({"layer": [chart.to_dict() for chart in charts]})
+    return Chart(layer=list(charts))
 
 
 def stack(*charts: Chart) -> Chart:
     """Stack charts vertically."""
-    return Chart({"vconcat": [chart.to_dict() for chart in charts]})
+    return Chart(vconcat=list(charts))
 
 
 def _complete(name: str, value: object) -> object:
+    if isinstance(value, list):
+        return [_complete(name, one) for one in value]
     if isinstance(value, str):
         value = encode_column(value)
-    elif isinstance(value, list):
-        return [_complete(name, one) for one in value]
-    if name in _ENDS and isinstance(value, dict):
+    # The second end of a span has the type of the first.
+    if name in {"x2", "y2"} and isinstance(value, dict):
         return {key: what for key, what in value.items() if key != "type"}
     return value
 
@@ -149,28 +120,16 @@ _WIDEST_RATIO = 2.0
 _ROOM = 0.25
 
 
-@dataclass(frozen=True)
-class Range:
-    """Range of an axis.
-
-    Attributes:
-        low: lower end.
-        high: upper end.
-        beyond: the value furthest outside and its time [s]; None if nothing is cut.
-    """
-
-    low: float
-    high: float
-    beyond: tuple[float, float] | None = None
-
-
-def usual_ends(values: pl.Series, *, exact: bool) -> list[float]:
+def usual_ends(values: pl.Series, *, exact: bool) -> tuple[float, float]:
     """Lower and upper end of a line: ``exact``, or without the most extreme 1 % of the values."""
-    shares = [0.0, 1.0] if exact else [_LONE_SHARE / 2.0, 1.0 - _LONE_SHARE / 2.0]
-    return [float(end) for end in np.quantile(values.to_numpy(), shares)]
+    share = 0.0 if exact else _LONE_SHARE / 2.0
+    low, high = np.quantile(values.to_numpy(), (share, 1.0 - share)).tolist()
+    return low, high
 
 
-def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
+def find_range(
+    lines: pl.DataFrame, usual: tuple[float, float]
+) -> tuple[float, float, tuple[float, float] | None]:
     """Axis range of lines over time: all values, or without isolated peaks that would flatten the rest.
 
     Args:
@@ -178,18 +137,19 @@ def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
         usual: range without isolated peaks.
 
     Returns:
-        The range including zero; peaks are cut if they would more than double it.
+        Both ends, which include zero; peaks are cut if they would more than double the range: then also the
+        value furthest outside and its time [s].
     """
     lines = lines.drop_nulls("value")
     values = lines["value"].to_numpy()
-    whole = Range(min(float(values.min()), 0.0), max(float(values.max()), 0.0))
+    lowest, highest = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
     low, high = min(usual[0], 0.0), max(usual[1], 0.0)
     room = _ROOM * (high - low)
-    if room == 0.0 or whole.high - whole.low <= _WIDEST_RATIO * (high - low):
-        return whole
-    low, high = max(low - room, whole.low), min(high + room, whole.high)
+    if room == 0.0 or highest - lowest <= _WIDEST_RATIO * (high - low):
+        return lowest, highest, None
+    low, high = max(low - room, lowest), min(high + room, highest)
     furthest = int(np.argmax(np.maximum(values - high, low - values)))
-    return Range(low, high, (float(values[furthest]), float(lines["t"][furthest])))
+    return low, high, (float(values[furthest]), float(lines["t"][furthest]))
 
 
 def round_up(value: float) -> float:
@@ -324,7 +284,7 @@ Columns = dict[str, object]
 
 def build_spec(drawing: Drawing) -> dict[str, object]:
     """Vega-Lite specification of a drawing in light colours, without its rows."""
-    return {"$schema": SCHEMA, **drawing.chart.to_dict(), "config": chart_config()}
+    return {"$schema": SCHEMA, **drawing.chart, "config": chart_config()}
 
 
 def fill_spec(drawing: Drawing) -> dict[str, object]:

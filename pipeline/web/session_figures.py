@@ -6,8 +6,9 @@ import polars as pl
 
 from pipeline.core import number_in
 from pipeline.report import theme
-from pipeline.report.figures import draw_figure, list_figures, slip_figures
+from pipeline.report.figures import draw_figure, slip_figures
 from pipeline.report.scene import RunReport, Scene
+from pipeline.report.sections import list_figures
 from pipeline.report.theme import build_spec, pack_rows, share_rows
 from pipeline.results import RunDiagnosis
 from pipeline.stages import find_residual_modulus
@@ -20,7 +21,7 @@ TABS: Mapping[str, tuple[str, ...]] = {
     "first": ("paths", "stretch"),
     "where": ("trajectory", "command_space", "reach", "velocities"),
     "effects": ("ladder", "step_response", "signature"),
-    "residual": ("residuals", "autocorrelation"),
+    "residual": ("residuals",),
     "budget": ("budget",),
 }
 """Figures of every tab, in order."""

@@ -24,7 +24,7 @@ from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
-from pipeline.report.sections_why import format_remaining
+from pipeline.report.sections import format_remaining
 from pipeline.results import RunDiagnosis, Value, read_result
 from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.simulate import simulate_case

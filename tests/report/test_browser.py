@@ -59,7 +59,7 @@ PROBE = """
     seen.outside = outside();
     seen.scrolled = [...document.querySelectorAll(".table")].map(
       (table) => table.scrollWidth - table.clientWidth);
-    seen.before = labels("modulus");
+    seen.before = labels("reach");
     seen.large = labels("velocities");
     const empty = plot("trajectory").querySelectorAll("path").length;
     document.getElementById("mark-from").value = "10";
@@ -69,7 +69,7 @@ PROBE = """
     seen.marked = document.querySelector("#marked span").textContent;
     seen.onMap = plot("trajectory").querySelectorAll("path").length - empty;
     document.getElementById("zoom-in").click();
-    await wait(() => labels("modulus").join() !== seen.before.join());
+    await wait(() => labels("reach").join() !== seen.before.join());
     await wait(() => labels("velocities").join() !== seen.large.join());
     seen.zoomed = labels("velocities");
     dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
@@ -196,17 +196,17 @@ def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(
     chrome.size(LAPTOP, 900)
     chrome.open((tmp_path / "page.html").as_uri())
     chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
-    chrome.click("#where > summary")
-    chrome.wait("!document.querySelector('#where .plot:not(.drawn)')")
+    chrome.click("#how-bad > summary")
+    chrome.wait("!document.querySelector('#how-bad .plot:not(.drawn)')")
     words = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((t) => t.{})"
-    large, whole = (words.format(name, "textContent") for name in ("velocities", "navigator"))
+    large, whole = (words.format(name, "textContent") for name in ("velocities", "modulus"))
     first = chrome.run(large)
     strip = chrome.run(whole)
-    chrome.drag("[data-figure=navigator]", (0.5, 0.3), (0.75, 0.3))
+    chrome.drag("[data-figure=modulus]", (0.5, 0.3), (0.75, 0.3))
     chrome.wait(f"{large}.join() !== {json.dumps(first)}.join()")
     assert {"70", "80"} <= set(chrome.run(large))  # type: ignore[call-overload]
     dragged = chrome.run(large)
-    chrome.run("document.querySelector('[data-figure=navigator]').focus()")
+    chrome.run("document.querySelector('[data-figure=modulus]').focus()")
     chrome.press("ArrowLeft", 37)
     chrome.wait(f"{large}.join() !== {json.dumps(dragged)}.join()")
     assert {"50", "60"} <= set(chrome.run(large))  # type: ignore[call-overload]
