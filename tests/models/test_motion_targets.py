@@ -14,7 +14,7 @@ from verbs import run_verb
 
 from pipeline import export
 from pipeline.export import Facts, export_model, list_targets
-from pipeline.export.spread import Response
+from pipeline.export.spread import find_response
 from pipeline.models import find_effect
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
@@ -169,7 +169,7 @@ SLIPPING = (
 
 
 def test_the_steady_motion_at_each_speed_is_that_of_the_exported_function() -> None:
-    response, turn = Response(Facts(make(*SLIPPING))), 0.25
+    response, turn = find_response(Facts(make(*SLIPPING))), 0.25
     for n, speed in enumerate(response.speeds.tolist()):
         half = turn * HUSKY.track_width_m / 2.0
         left, right = (speed - half) / HUSKY.wheel_radius_m, (speed + half) / HUSKY.wheel_radius_m
@@ -184,7 +184,7 @@ def test_a_multiplier_is_told_by_speed_where_one_does_not_fit() -> None:
     one = export_model(make(find_effect("effective_track")(k=1.8)), "ros2_control")
     assert "does not fit" not in one
     several = export_model(make(*SLIPPING), "ros2_control")
-    response = Response(Facts(make(*SLIPPING)))
+    response = find_response(Facts(make(*SLIPPING)))
     line = next(line for line in several.splitlines() if "wheel_separation_multiplier does not fit" in line)
     pairs = re.findall(r"([\d.]+) at ([\d.]+) m/s", line)
     told = [float(value) for value, _ in pairs]
