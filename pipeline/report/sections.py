@@ -35,12 +35,13 @@ from pipeline.report.figures.residual_figures import REACH, RESIDUALS, SIGNATURE
 from pipeline.report.figures.slip_figures import COMMAND_SPACE, MODULUS, STEP_RESPONSE, TRAJECTORY
 from pipeline.report.figures.stretch_figures import MOTION, PATHS
 from pipeline.report.scene import RunReport
-from pipeline.results import Named, has_no_pose, read_findings
+from pipeline.results import Named, has_no_pose, is_small, read_findings, split_main
 from pipeline.words import (
     describe_cause,
     describe_motion,
     describe_regions,
     describe_rest,
+    describe_separation,
     describe_unexplained,
     format_remaining_error,
     format_short,
@@ -48,6 +49,7 @@ from pipeline.words import (
     format_suggestion,
     list_largest_falls,
     list_terms,
+    name_group,
     name_span,
     suggest_export,
 )
@@ -166,7 +168,7 @@ def view_where(report: RunReport) -> dict[str, object]:
 
 def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
     """Regions of the ideal model's error, as on the screen: each with its part of the error."""
-    if report.is_refused:
+    if report.refusal:
         return []
     parted = (text.partition(": ") for text in describe_regions(report.diagnosis.where)[:most])
     return [(region, part) for region, _, part in parted]
@@ -187,7 +189,7 @@ def view_what_now(report: RunReport) -> dict[str, object]:
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:
     """Next steps with their commands, in descending order of usefulness."""
-    if report.is_refused:
+    if report.refusal:
         log = shlex.quote(str(report.part("log").get("path") or "run.mcap"))
         return [
             ("List the contents of the log", f"slip inspect {log}"),
@@ -375,21 +377,24 @@ def format_remaining(report: RunReport) -> str:
 
 def view_why(report: RunReport) -> dict[str, object]:
     """Effects, open questions, and the split in one sentence."""
-    main, minor = report.effects
+    diagnosis = report.diagnosis
+    main, minor = split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
     rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
-    drivetrain, ground, cross = report.split
+    split = report.part("split")
+    drivetrain, ground, cross = (number_in(split, name) for name in ("drivetrain", "ground", "cross"))
     return {
         "refusal": report.refusal,
         "diagnosed": report.is_diagnosed,
         "named": [_view_effect(report, entry) for entry in main],
         "smaller": [_view_effect(report, entry) for entry in minor],
-        "groups": report.small_groups,
-        "undecided": bool(report.undecided),
+        # A group that counts as one smaller effect.
+        "groups": sum(is_small(group.in_model, diagnosis.ladder) for group in diagnosis.undecided),
+        "undecided": bool(diagnosis.undecided),
         "remaining": format_remaining(report),
         "table": Table("Effects", _HEAD, rows),
         "open": list(_list_open(report)),
         "split": None
-        if drivetrain is None or ground is None or cross is None or report.is_refused
+        if drivetrain is None or ground is None or cross is None or report.refusal
         else {"from_drivetrain": drivetrain > ground, "words": format_split(drivetrain, ground, cross)},
     }
 
@@ -458,8 +463,8 @@ def _format_gain(gain: float) -> str:
 def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     """What this log does not determine, and what no effect of the catalogue explains, with its formula."""
     diagnosis = report.diagnosis
-    for names, advice in report.undecided:
-        yield "undecided", f"{names}: {advice}", ""
+    for group in diagnosis.undecided:
+        yield "undecided", f"{name_group(group.candidates)}: {describe_separation(group)}", ""
     if diagnosis.unexplained is not None:
         rest = diagnosis.unexplained
         terms = list_terms(rest)
@@ -510,7 +515,7 @@ def sum_up_slip(report: RunReport) -> str:
     texts = [
         f"{format_number(one, digits=2)} m/s {INPUT_WORDS[name]}"
         for name, one in medians.items()
-        if one is not None and not report.is_refused
+        if one is not None and not report.refusal
     ]
     return f"median slip modulus {', '.join(texts)}" if texts else ""
 
