@@ -5,13 +5,13 @@ A page is one file without network requests. Vega evaluates its expressions with
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Literal, get_args
 
-from pipeline.core import FigureFormat, format_recorded, naming_os_errors, require_package
+from pipeline.core import format_recorded, naming_os_errors, require_package
 from pipeline.report import (
     Picture,
     ReportError,
@@ -26,7 +26,6 @@ from pipeline.report.figures import Figure, draw_figure
 from pipeline.report.scene import RunReport, Scene
 from pipeline.report.sections import SECTIONS, list_figures, summarise_health
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
-from pipeline.store import Store
 
 
 def render_report(report: RunReport) -> str:
@@ -181,7 +180,10 @@ def _render(name: str, spec: dict[str, object], format: str) -> bytes:  # noqa: 
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
     if format == "svg":
-        return _number_ids(vl_convert.vegalite_to_svg(spec), name).encode()
+        svg: str = vl_convert.vegalite_to_svg(spec)
+        # The engine's counter of ids continues from one figure to the next.
+        order = {found: f"{name}-{i}" for i, found in enumerate(dict.fromkeys(_ID.findall(svg)))}
+        return _ID.sub(lambda match: order[match.group()], svg).encode()
     drawn: bytes = (
         vl_convert.vegalite_to_pdf(spec)
         if format == "pdf"
@@ -197,18 +199,3 @@ def _write(path: Path, content: bytes) -> None:
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
-
-
-def _number_ids(svg: str, prefix: str) -> str:
-    """Renumber the ids of an SVG from zero; the engine's counter continues from one figure to the next."""
-    order = {name: f"{prefix}-{i}" for i, name in enumerate(dict.fromkeys(_ID.findall(svg)))}
-    return _ID.sub(lambda match: order[match.group()], svg)
-
-
-def add_figures(
-    store: Store, draw: Callable[[], Iterable[Picture]], figures: FigureFormat | None
-) -> dict[str, Path]:
-    """Write figures to `figures/` if a format is given; return the files by name."""
-    if figures is None:
-        return {}
-    return {path.name: path for path in write_pictures(draw(), store.root / "figures", figures)}

@@ -296,31 +296,25 @@ def fill_spec(drawing: Drawing) -> dict[str, object]:
 
 
 def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:
-    """Rows of all drawings, each name once, as columns; texts are encoded as indices into a list of levels.
+    """Rows of all drawings, each name once, as `pack_rows` has them."""
+    return pack_rows({name: frame for drawing in drawings for name, frame in drawing.rows.items()})
+
+
+def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
+    """Rows by name as columns; texts are encoded as indices into a list of levels.
 
     Returns:
         By name, columns: a list of numbers, or ``{"levels": [...], "codes": [...]}`` for texts.
     """
-    frames: dict[str, pl.DataFrame] = {}
-    for drawing in drawings:
-        frames.update(drawing.rows)
-    return pack_rows(frames)
-
-
-def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
-    """Rows by name as columns, as from `share_rows`."""
-    return {name: _pack_columns(frame) for name, frame in sorted(frames.items())}
-
-
-def _pack_columns(frame: pl.DataFrame) -> Columns:
-    packed: Columns = {}
-    for column in _round_floats(frame).iter_columns():
-        if column.dtype == pl.String:
-            levels = column.unique(maintain_order=True)
-            codes = column.replace_strict(levels, list(range(levels.len())), return_dtype=pl.Int64)
-            packed[column.name] = {"levels": levels.to_list(), "codes": codes.to_list()}
-        else:
-            packed[column.name] = column.to_list()
+    packed: dict[str, Columns] = {}
+    for name, frame in sorted(frames.items()):
+        columns = packed[name] = {}
+        for column in _round_floats(frame).iter_columns():
+            columns[column.name] = column.to_list()
+            if column.dtype == pl.String:
+                levels = column.unique(maintain_order=True)
+                codes = column.replace_strict(levels, list(range(levels.len())), return_dtype=pl.Int64)
+                columns[column.name] = {"levels": levels.to_list(), "codes": codes.to_list()}
     return packed
 
 
@@ -333,7 +327,6 @@ def _round_floats(frame: pl.DataFrame) -> pl.DataFrame:
 # Bundling takes most of a second and always gives the same text, so it is cached in the user's cache folder.
 # A missing, damaged or read-only cache only costs that second.
 
-_DIGEST_LENGTH = 64
 _EXPOSE = "window.vegaEmbed = vegaEmbed;"
 
 
@@ -341,16 +334,19 @@ def load_bundle() -> str:
     """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
     require_package("vl_convert", "report", "a page with figures")
     path = cache_path()
-    cached = _read_checked(path)
-    if cached is not None:
-        return cached
+    with contextlib.suppress(OSError):
+        digest, _, body = path.read_bytes().partition(b"\n")
+        if hashlib.sha256(body).hexdigest().encode() == digest:
+            return body.decode()
     import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
 
+    script: str = vl_convert.javascript_bundle(_EXPOSE)
     # A closing tag inside a string literal would end the script element.
-    script: str = (
-        vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
-    )
-    _write_checked(path, script)
+    script = script.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    body = script.encode()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
     return script
 
 
@@ -368,9 +364,10 @@ def warm_bundle() -> None:
     if not can_draw():
         return
     path = cache_path()
-    if path.is_file() or not _can_write(path.parent):
-        return
-    threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.is_file() and os.access(path.parent, os.W_OK):
+        threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
 
 
 def _bundle_apart() -> None:
@@ -389,32 +386,6 @@ def cache_path() -> Path:
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
     return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
-
-
-def _read_checked(path: Path) -> str | None:
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    digest, _, script = content.partition(b"\n")
-    if len(digest) != _DIGEST_LENGTH or hashlib.sha256(script).hexdigest().encode() != digest:
-        return None
-    return script.decode()
-
-
-def _write_checked(path: Path, script: str) -> None:
-    body = script.encode()
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
-
-
-def _can_write(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
 
 
 MAP_WIDTH, MAP_LOWEST, MAP_HIGHEST = 480, 260, 420

@@ -188,9 +188,27 @@ def draw_command_space(scene: Scene) -> Drawing | None:
 
 
 def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Cells of the plane of commands: edges, median slip modulus, samples; empty without slip."""
+    """Cells of equal size over the plane of commands: edges, median slip modulus, samples.
+
+    Empty without slip.
+    """
     slip = scene.sound_slip.get(scene.report.main_input)
-    return {} if slip is None else {"command_cells": _count_cells(slip)}
+    if slip is None:
+        return {}
+    edges = {}
+    for name, short in (("f_x", "x"), ("f_w", "w")):
+        low, high = _bound(slip, name)
+        size = (high - low) / _CELLS
+        number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
+        edges[f"{short}_low"] = low + number * size
+        edges[f"{short}_high"] = low + (number + 1) * size
+    cells = (
+        slip.select("modulus", **edges)
+        .group_by(*edges)
+        .agg(modulus=pl.col("modulus").median(), samples=pl.len())
+        .filter(pl.col("samples") >= _FEWEST_SAMPLES)
+    )
+    return {"command_cells": cells.sort(*edges)}
 
 
 def _bound(slip: pl.DataFrame, name: str) -> list[float]:
@@ -199,27 +217,6 @@ def _bound(slip: pl.DataFrame, name: str) -> list[float]:
         -round_up(-low) if low < -_SMALLEST_BOUND else -_SMALLEST_BOUND,
         round_up(high) if high > _SMALLEST_BOUND else _SMALLEST_BOUND,
     ]
-
-
-def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
-    """Cells of equal size over the plane of commands: edges, median slip modulus, samples."""
-    columns = []
-    for name, short in (("f_x", "x"), ("f_w", "w")):
-        low, high = _bound(slip, name)
-        size = (high - low) / _CELLS
-        number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
-        columns += [
-            (low + number * size).alias(f"{short}_low"),
-            (low + (number + 1) * size).alias(f"{short}_high"),
-        ]
-    edges = ["x_low", "x_high", "w_low", "w_high"]
-    return (
-        slip.select(*columns, "modulus")
-        .group_by(edges)
-        .agg(modulus=pl.col("modulus").median(), samples=pl.len())
-        .filter(pl.col("samples") >= _FEWEST_SAMPLES)
-        .sort(edges)
-    )
 
 
 def format_cells(scene: Scene) -> str:
