@@ -295,17 +295,19 @@ def _format_stretch(start: float | None, end: float | None) -> str:
 
 
 def _tabulate_losses(report: RunReport) -> Table:
-    rows = []
-    for loss in objects_in(report.part("log"), "losses"):
-        chunks, size = number_in(loss, "chunks"), number_in(loss, "bytes")
-        rows.append(
-            [
-                str(loss.get("kind", "")),
-                MISSING if size is None else format_size(size),
-                MISSING if chunks is None else f"{chunks:.0f}",
-                _format_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
-            ]
-        )
+    def show(loss: Mapping[str, object], key: str, form: Callable[[float], str]) -> str:
+        value = number_in(loss, key)
+        return MISSING if value is None else form(value)
+
+    rows = [
+        [
+            str(loss.get("kind", "")),
+            show(loss, "bytes", format_size),
+            show(loss, "chunks", "{:.0f}".format),
+            _format_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
+        ]
+        for loss in objects_in(report.part("log"), "losses")
+    ]
     head = (Column("kind"), Column("size", number=True), Column("chunks", number=True), Column("stretch"))
     return Table("What the log has lost", head, rows)
 
@@ -425,8 +427,9 @@ def _list_alike(effect: Named) -> tuple[str, str] | None:
 def _list_parameters(effect: Named) -> list[list[str | Cell]]:
     """One row per parameter: value, interval, and in the first row the gain of the effect."""
     notes = [f"same as {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
-    gain = _format_gain(effect.gain)
-    without = Cell(gain, small=_PATHS.get(effect.path, "")) if gain else ""
+    form = ",.0f" if effect.gain >= _MANY_FOLD else ".3g"
+    is_known = math.isfinite(effect.gain)
+    without = Cell(f"x {effect.gain + 1.0:{form}}", small=_PATHS.get(effect.path, "")) if is_known else ""
     rows: list[list[str | Cell]] = []
     for key, value in effect.parameters.items():
         shown = "" if value.unit in {"1", ""} else set_squares(value.unit)
@@ -450,14 +453,6 @@ def _format_within(value: float, low: float, high: float) -> tuple[str, str]:
         return format_number(value, digits=4) if math.isfinite(value) else "", ""
     text, *both = split_interval(value, low, high)
     return text, " to ".join(both)
-
-
-def _format_gain(gain: float) -> str:
-    if not math.isfinite(gain):
-        return ""
-    if gain >= _MANY_FOLD:
-        return f"x {gain + 1.0:,.0f}"
-    return f"x {gain + 1.0:.3g}"
 
 
 def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
@@ -526,16 +521,6 @@ def sum_up_rest(report: RunReport) -> str:
     return format_remaining(report) or (ideal if report.diagnosis.ladder else "")
 
 
-def sum_up_health(report: RunReport) -> str:
-    """Losses, gaps and serious findings."""
-    return ", ".join(words for _, words in summarise_health(report))
-
-
-def sum_up_provenance(report: RunReport) -> str:
-    """Path of the log."""
-    return str(report.part("log").get("path") or "")
-
-
 SECTIONS = (
     Section("glance", "At a glance", view_glance, (PATHS, MOTION)),
     Section("why", "Effects", view_why, (LADDER, SIGNATURE)),
@@ -548,8 +533,18 @@ SECTIONS = (
         figures=(BUDGET, RESIDUALS, STEP_RESPONSE, SPLIT, ENOUGH),
         sum_up=sum_up_rest,
     ),
-    Section("health", "Data health", view_health, sum_up=sum_up_health),
-    Section("provenance", "Provenance", view_provenance, sum_up=sum_up_provenance),
+    Section(
+        "health",
+        "Data health",
+        view_health,
+        sum_up=lambda report: ", ".join(words for _, words in summarise_health(report)),
+    ),
+    Section(
+        "provenance",
+        "Provenance",
+        view_provenance,
+        sum_up=lambda report: str(report.part("log").get("path") or ""),
+    ),
 )
 """Sections of the page in order: the verdict with the first picture, the effects, what to do next; others are
 folded behind a line that says what they hold."""

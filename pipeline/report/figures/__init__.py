@@ -75,7 +75,8 @@ def time_axis(
 
 def draw_lines(
     names: Sequence[str],
-    lines: Thinned,
+    lines: pl.DataFrame,
+    usual: tuple[float, float],
     quantity: tuple[str, str],
     colour: Channel,
     *,
@@ -88,7 +89,8 @@ def draw_lines(
 
     Args:
         names: names of the rows of the lines.
-        lines: lines that the vertical axis is made for.
+        lines: rows that the vertical axis is made for, with ``t`` [s] and ``value``.
+        usual: their range without isolated peaks.
         quantity: what the panel shows, and its unit.
         colour: colour of each series.
         x: axis of time.
@@ -96,7 +98,7 @@ def draw_lines(
         bands: bands behind the lines; None for all of `shade_spans`.
         room: free margin above and below, as a fraction of the range of the lines.
     """
-    low, high, beyond = find_range(lines.frame, lines.usual)
+    low, high, beyond = find_range(lines, usual)
     margin = room * (high - low)
     scale = {"domain": [low - margin, high + margin], "nice": beyond is None}
     y = make_axis("value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)

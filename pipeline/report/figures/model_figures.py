@@ -34,7 +34,8 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     panels = [
         figures.draw_lines(
             [f"velocity_{component}", *([f"model_{component}"] if model else [])],
-            line,
+            line.frame,
+            line.usual,
             _QUANTITIES[component],
             colour,
             x=figures.time_axis(scene, has_title=component == COMPONENTS[-1]),

@@ -8,7 +8,7 @@ from pipeline.estimation.effect_signature import SINCE_STEP, VARIABLES, Signatur
 from pipeline.report import figures, format_known_share, format_number, theme
 from pipeline.report.figures import Figure
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
-from pipeline.report.scene import LINE_BINS, Scene, Thinned, break_lines, thin_series
+from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series
 from pipeline.report.theme import Chart, Drawing, layer, make_axis, stack, usual_ends
 
 
@@ -20,7 +20,8 @@ def draw_horizon_errors(scene: Scene) -> Drawing | None:
     errors, rows = motion.horizon_errors, list_horizon_errors(scene)
     chart = figures.draw_lines(
         ["reach"],
-        Thinned(rows["reach"], 0, 0, usual_ends(errors["ideal"], exact=False)),
+        rows["reach"],
+        usual_ends(errors["ideal"], exact=False),
         ("error of a 2 s prediction", "m"),
         figures.before_and_after(motion.input),
         x=figures.time_axis(scene),

@@ -251,7 +251,8 @@ def draw_modulus(scene: Scene) -> Drawing | None:
         note = f"Enlarged below: the {length:g} s with the most slip. Drag here to draw others. {note}"
     chart = figures.draw_lines(
         ["modulus"],
-        lines,
+        lines.frame,
+        lines.usual,
         ("slip modulus", "m/s"),
         colour,
         x=figures.time_axis(scene),

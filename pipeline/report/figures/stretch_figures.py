@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.report import figures, theme
 from pipeline.report.figures import Figure
-from pipeline.report.scene import Scene, Thinned, break_lines
+from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import Channel, Chart, Drawing, layer, make_axis, stack, usual_ends
 
 _ROOM = 0.15
@@ -112,7 +112,8 @@ def draw_motion(scene: Scene) -> Drawing | None:
         rows[f"stretch_v_{name}"] = fixed
         panel = figures.draw_lines(
             [f"stretch_v_{name}", f"stretch_model_{name}"],
-            Thinned(both, 0, 0, usual_ends(both["value"].drop_nulls(), exact=True)),
+            both,
+            usual_ends(both["value"].drop_nulls(), exact=True),
             (words, unit),
             _colour_series(source),
             x=figures.time_axis(scene, scene.stretch, has_title=name == list(_SERIES)[-1], ticks=7),
