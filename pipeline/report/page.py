@@ -182,7 +182,7 @@ def _render(name: str, spec: dict[str, object], format: str) -> bytes:  # noqa: 
     if format == "svg":
         svg: str = vl_convert.vegalite_to_svg(spec)
         # The engine's counter of ids continues from one figure to the next.
-        order = {found: f"{name}-{i}" for i, found in enumerate(dict.fromkeys(_ID.findall(svg)))}
+        order = {one: f"{name}-{i}" for i, one in enumerate(dict.fromkeys(_ID.findall(svg)))}
         return _ID.sub(lambda match: order[match.group()], svg).encode()
     drawn: bytes = (
         vl_convert.vegalite_to_pdf(spec)

@@ -98,8 +98,8 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     x = make_axis("t", "held-out error over 2 s [m]", (0.0, top * _ROOM), tickCount=5, grid=False)
     base, bars, words = figures.name_bars("ladder", "step")
     bars = bars.encode(x=x, color=encode_column("series:N", scale=scale, legend=None))
-    told = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
-    text = f"Error of two-second predictions {INPUT_WORDS.get(source, '')} on held-out data. {told}."
+    numbers = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
+    text = f"Error of two-second predictions {INPUT_WORDS.get(source, '')} on held-out data. {numbers}."
     charts, note = [bars, words], ""
     if floor is not None and math.isfinite(floor.t_mrmse_m):
         size = format_length(floor.t_mrmse_m)
@@ -137,8 +137,8 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
             name = f"+ {', '.join(added)}{rises and f' ({rises})'}"
         angle = step.r_mrmse_rad
         degrees = [] if math.isnan(angle) else [f"{format_angle(angle).partition(' ')[0]}\u00b0"]
-        told = " \u00b7 ".join([format_length(step.t_mrmse_m), *degrees])
-        rows.append((name, step.t_mrmse_m, told, "model" if step.effects else "ideal"))
+        numbers = " \u00b7 ".join([format_length(step.t_mrmse_m), *degrees])
+        rows.append((name, step.t_mrmse_m, numbers, "model" if step.effects else "ideal"))
     return {"ladder": pl.DataFrame(rows, schema=_SCHEMA, orient="row")}
 
 
@@ -238,10 +238,10 @@ def draw_budget(scene: Scene) -> Drawing | None:
     errors = {} if position is None else {part.effect: part.share for _, part in position.causes}
     for kind, part in slip.causes:
         low, high = (top - end if math.isfinite(end) else None for end in (part.high, part.low))
-        told = (
+        numbers = (
             f"slip {format_known_share(part.share)}, 2 s error {format_known_share(errors.get(part.effect))}"
         )
-        parts.append((name_term(part.effect), top, top - part.share, low, high, kind, told))
+        parts.append((name_term(part.effect), top, top - part.share, low, high, kind, numbers))
         top -= part.share
     rows = pl.DataFrame(parts, schema=_SCHEMA_BUDGET, orient="row")
     if rows.is_empty():
@@ -267,7 +267,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
         "Shapley shares (independent of order). Lines are 95 % intervals. "
         "Shares are taken off from 100 %; a negative share is a step to the right: it increases slip."
     )
-    causes = "; ".join(f"{cause}: {told}" for cause, *_, told in rows.iter_rows())
+    causes = "; ".join(f"{cause}: {numbers}" for cause, *_, numbers in rows.iter_rows())
     size = f"{format_number(slip.total)} m\u00b2/s\u00b2"
     text = (
         f"Mean square slip {INPUT_WORDS.get(slip.input, '')}, {size} over half a second by cause, shares of "

@@ -202,13 +202,13 @@ def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
         number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
         edges[f"{short}_low"] = low + number * size
         edges[f"{short}_high"] = low + (number + 1) * size
-    cells = (
+    grid = (
         slip.select("modulus", **edges)
         .group_by(*edges)
         .agg(modulus=pl.col("modulus").median(), samples=pl.len())
         .filter(pl.col("samples") >= _FEWEST_SAMPLES)
     )
-    return {"command_cells": cells.sort(*edges)}
+    return {"command_cells": grid.sort(*edges)}
 
 
 def _bound(slip: pl.DataFrame, name: str) -> list[float]:
