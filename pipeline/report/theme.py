@@ -388,33 +388,6 @@ def cache_path() -> Path:
     return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
 
 
-MAP_WIDTH, MAP_LOWEST, MAP_HIGHEST = 480, 260, 420
-_MARGIN = 0.05
-_SMALLEST_SPAN_M = 1.0
-
-
-def fit_equal_aspect(
-    x: list[float], y: list[float], *, width: float = MAP_WIDTH
-) -> tuple[float, list[float], list[float]]:
-    """Height [px] and domains [m] that give x and y the same scale and contain both extents."""
-    wide, tall = x[1] - x[0], y[1] - y[0]
-    height = min(max(width * tall / wide, MAP_LOWEST), MAP_HIGHEST)
-    scale = max(wide / width, tall / height)
-    return round(height), _widen(x, scale * width), _widen(y, scale * height)
-
-
-def _widen(extent: list[float], span: float) -> list[float]:
-    middle = (extent[0] + extent[1]) / 2.0
-    return [middle - span / 2.0, middle + span / 2.0]
-
-
-def find_extent(values: pl.Series) -> list[float]:
-    """Limits of an axis that contains the values [m], with a margin."""
-    low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
-    span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
-    return [round(value, 4) for value in _widen([low, high], span)]
-
-
 @dataclass(frozen=True)
 class Drawing:
     """Figure of one run.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
@@ -42,8 +43,10 @@ def draw_figure(figure: Figure, scene: Scene) -> list[Picture]:
     return [] if drawn is None else [Picture(figure.id, figure.title, drawn, figure.width)]
 
 
-WIDTH = 720
+WIDTH, MAP_WIDTH = 720, 480
 GUTTER = 46
+_MARGIN = 0.05
+_SMALLEST_SPAN_M = 1.0
 
 SERIES_WORDS = {
     "velocity": "measured",
@@ -71,6 +74,40 @@ def time_axis(
     scale = {"domain": list(span or scene.time_domain or (0, 1)), "nice": False, "zero": False}
     title = "time since the start of the run [s]" if has_title else None
     return make_axis("t", title, scale=scale, tickCount=ticks, labels=has_title, grid=False)
+
+
+def make_map(
+    places: pl.DataFrame, origin: tuple[float, float], heights: tuple[float, float]
+) -> tuple[Channel, Channel, dict[str, Any]]:
+    """Axes of a map on which x and y have the same scale.
+
+    Args:
+        places: all ``x`` and ``y`` [m] that the map contains.
+        origin: what was subtracted from them [m].
+        heights: smallest and largest height of the map [px].
+
+    Returns:
+        The axes; and width and height of the chart, with the metadata that let the page fit both to its room.
+    """
+    middles, spans = [], []
+    for name in "xy":
+        low, high = float(places[name].min() or 0.0), float(places[name].max() or 0.0)  # type: ignore[arg-type]
+        middles.append((low + high) / 2.0)
+        spans.append(max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN))
+    height = round(min(max(MAP_WIDTH * spans[1] / spans[0], heights[0]), heights[1]))
+    metres = max(spans[0] / MAP_WIDTH, spans[1] / height)
+    equal: dict[str, object] = {"lowest": heights[0], "highest": heights[1]}
+    axes = []
+    for name, middle, span, pixels, offset in zip(
+        "xy", middles, spans, (MAP_WIDTH, height), origin, strict=True
+    ):
+        equal[name] = [round(middle - span / 2.0, 4), round(middle + span / 2.0, 4)]
+        half, less = metres * pixels / 2.0, f", less {offset:,.0f} m" if offset else ""
+        scale = {"domain": [middle - half, middle + half], "nice": False, "zero": False}
+        title = f"{name} in the map{less} [m]"
+        axes.append(make_axis(name, title, scale=scale, tickCount=5, minExtent=GUTTER - 20))
+    meta = {"gutter": GUTTER + 4, "equal": equal}
+    return axes[0], axes[1], {"width": MAP_WIDTH, "height": height, "usermeta": meta}
 
 
 def draw_lines(

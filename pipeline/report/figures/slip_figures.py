@@ -8,15 +8,9 @@ from pipeline.report import figures, format_number, theme
 from pipeline.report.figures import Figure
 from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import (
-    MAP_HIGHEST,
-    MAP_LOWEST,
-    MAP_WIDTH,
-    Channel,
     Chart,
     Drawing,
     encode_column,
-    find_extent,
-    fit_equal_aspect,
     layer,
     make_axis,
     round_up,
@@ -30,10 +24,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     if track is None:
         return None
     frame = track.frame
-    extent = [find_extent(frame["x"]), find_extent(frame["y"])]
-    height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
-    x = _make_axis("x", scene.origin[0], x_domain)
-    y = _make_axis("y", scene.origin[1], y_domain)
+    x, y, properties = figures.make_map(frame, scene.origin, (260, 420))
     at = {"x": "x:Q", "y": "y:Q"}
     line = Chart.of_rows("path").mark("line", color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False)
     tooltip = [
@@ -75,11 +66,8 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         .encode(text="place:N")
         for end, dy in (("start", -9), ("end", 12))
     ]
-    meta = figures.brush_over_plane("x", "y") | {
-        "dots": {"track": "measured"},
-        "equal": {"x": extent[0], "y": extent[1], "lowest": MAP_LOWEST, "highest": MAP_HIGHEST},
-    }
-    chart = layer(*charts, spots, *words).properties(width=MAP_WIDTH, height=height, usermeta=meta)
+    properties["usermeta"] |= figures.brush_over_plane("x", "y") | {"dots": {"track": "measured"}}
+    chart = layer(*charts, spots, *words).properties(**properties)
     rows |= {
         "track": frame,
         "path": break_lines(frame.select("x", "y", "piece"), "x", "y"),
@@ -121,12 +109,6 @@ def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
     shown = motion.arcs.filter(pl.col("piece") % 2 == 0)
     moved = shown.with_columns(pl.col("x") - east, pl.col("y") - north)
     return {"arcs": break_lines(moved, "x", "y")}
-
-
-def _make_axis(name: str, offset: float, domain: list[float]) -> Channel:
-    less = f", less {offset:,.0f} m" if offset else ""
-    title, scale = f"{name} in the map{less} [m]", {"domain": domain, "nice": False, "zero": False}
-    return make_axis(name, title, scale=scale, tickCount=5, minExtent=figures.GUTTER - 20)
 
 
 def format_map(scene: Scene) -> str:

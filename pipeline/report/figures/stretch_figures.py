@@ -8,7 +8,7 @@ import polars as pl
 from pipeline.report import figures, theme
 from pipeline.report.figures import Figure
 from pipeline.report.scene import Scene, break_lines
-from pipeline.report.theme import Channel, Chart, Drawing, layer, make_axis, stack, usual_ends
+from pipeline.report.theme import Channel, Chart, Drawing, layer, stack, usual_ends
 
 _ROOM = 0.15
 """Free margin above and below, as a fraction of a panel's height."""
@@ -31,11 +31,8 @@ def draw_paths(scene: Scene) -> Drawing | None:
         return None
     ideal = scene.cut_arcs(scene.report.motion.ideal_arcs)
     both = pl.concat([scene.driven.select("x", "y"), ideal.select("x", "y")])
-    extent = [theme.find_extent(both["x"]), theme.find_extent(both["y"])]
-    height, x_domain, y_domain = theme.fit_equal_aspect(extent[0], extent[1])
-    scales = [{"domain": domain, "nice": False, "zero": False} for domain in (x_domain, y_domain)]
-    x = make_axis("x", "x in the map [m]", scale=scales[0], tickCount=5)
-    y = make_axis("y", "y in the map [m]", scale=scales[1], tickCount=5, minExtent=figures.GUTTER - 20)
+    x, y, properties = figures.make_map(both, scene.origin, (300, 330))
+    properties["usermeta"]["dots"] = {"stretch_way": "measured", "stretch_arcs": "model"}
     colour = _colour_series(scene.report.motion.input)
 
     def line(name: str, **look: object) -> Chart:
@@ -53,15 +50,7 @@ def draw_paths(scene: Scene) -> Drawing | None:
         Chart.of_rows("stretch_starts")
         .mark("circle", size=30, color=theme.MEASURED, opacity=1)
         .encode(x=x, y=y),
-    ).properties(
-        width=480,
-        height=height,
-        usermeta={
-            "gutter": figures.GUTTER + 4,
-            "dots": {"stretch_way": "measured", "stretch_arcs": "model"},
-            "equal": {"x": extent[0], "y": extent[1], "lowest": 300, "highest": 330},
-        },
-    )
+    ).properties(**properties)
     driven = break_lines(scene.driven, "x", "y").with_columns(series=pl.lit("velocity"))
     ideal_rows = break_lines(ideal, "x", "y").with_columns(series=pl.lit(scene.report.motion.input))
     note = (
