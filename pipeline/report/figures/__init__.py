@@ -121,6 +121,7 @@ def draw_lines(
     height: int,
     bands: Sequence[Chart] | None = None,
     room: float = 0.0,
+    stroke: float = 1.2,
 ) -> Chart:
     """Draw a panel of lines over time in front of bands; isolated peaks beyond its axis are told.
 
@@ -134,6 +135,7 @@ def draw_lines(
         height: of the panel [px].
         bands: bands behind the lines; None for all of `shade_spans`.
         room: free margin above and below, as a fraction of the range of the lines.
+        stroke: width of the lines [px].
     """
     low, high, beyond = find_range(lines, usual)
     margin = room * (high - low)
@@ -144,7 +146,9 @@ def draw_lines(
         furthest, time = f"{format_number(beyond[0])}{suffix_unit(quantity[1])}", format_number(beyond[1])
         title["subtitle"] = f"peaks cut; the furthest is {furthest} at {time} s"
     drawn = [
-        Chart.of_rows(name).mark("line", clip=True, order=False).encode(x=x, y=y, color=colour)
+        Chart.of_rows(name)
+        .mark("line", clip=True, order=False, strokeWidth=stroke)
+        .encode(x=x, y=y, color=colour)
         for name in names
     ]
     behind = shade_spans() if bands is None else bands

@@ -110,6 +110,7 @@ def draw_motion(scene: Scene) -> Drawing | None:
             bands=marked,
             # Another model may exceed the range of the first one; the axis is fixed.
             room=_ROOM,
+            stroke=1.8,
         )
         panels.append(panel.properties(width=480))
     rows[figures.MARKED_SPANS] = figures.EMPTY_SPANS
