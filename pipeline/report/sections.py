@@ -45,7 +45,6 @@ from pipeline.words import (
     describe_unexplained,
     format_remaining_error,
     format_short,
-    format_step,
     format_suggestion,
     list_largest_falls,
     list_terms,
@@ -110,7 +109,6 @@ def view_how_bad(report: RunReport) -> dict[str, object]:
         "refusal": report.refusal,
         "cards": cards,
         "standing": format_standing(report),
-        "ladder": [format_step(step) for step in report.diagnosis.ladder],
         "table": _tabulate(report),
     }
 
