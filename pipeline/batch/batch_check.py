@@ -21,6 +21,7 @@ from pipeline.store import (
     Tally,
     check_home,
     encode_run,
+    list_old,
     load_manifest,
 )
 
@@ -81,8 +82,8 @@ def _repair_run(
     store: Store, home: str, codes: set[str], log: str, *, follow_remote: bool
 ) -> tuple[str, str]:
     """Action and its text for the problems of a run; ``log`` is where the notes of batches saw its log."""
-    if "manifest_too_new" in codes:
-        return "left", "a newer version wrote it: use that one"
+    if "other_version" in codes:
+        return "left", "another version of slip wrote it: use that one"
     if codes == {"extra_file"}:
         return "left", "all that was written is intact; remove the files that were not written with it"
     manifest = _read_manifest(store, home)
@@ -268,7 +269,7 @@ def read_status(store: Store) -> Status:
         entries=entries,
         counts={state: states.count(state) for state in _COUNTED},
         bytes=size,
-        old_generations=sum(len(manifest.earlier) for manifest in survey.manifests),
+        old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),
         last=max((entry.at for entry in entries), default=None),
     )

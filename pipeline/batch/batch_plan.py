@@ -193,7 +193,7 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
-    asked_again = {run for run, manifest in manifests.items() if store.is_asked_again(manifest)}
+    asked_again = {run for run, manifest in manifests.items() if manifest.again}
     hasher = Fingerprinter(request.options)
     items = [_look_at(path, hasher, ledger) for path in paths]
     settled: list[Entry] = []

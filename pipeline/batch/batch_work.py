@@ -96,7 +96,7 @@ class Ledger:
         self._notes.write(entry.log.path, content)
 
 
-def _as_entry(content: Mapping[str, JSON]) -> Entry | None:
+def _as_entry(content: Mapping[str, object]) -> Entry | None:
     try:
         return msgspec.convert(content, Entry)
     except msgspec.ValidationError:

@@ -13,10 +13,12 @@ from stat import S_ISDIR
 
 from pipeline.core import SlipError, guess_names, resolve_inside
 from pipeline.logs import RemotePath, list_files, locate_recorded, spell_location, stem_of, to_location
-from pipeline.store.files import JSON, Manifest, hash_bytes
+from pipeline.store.files import hash_bytes
+from pipeline.store.manifests import JSON, Manifest
 from pipeline.store.names import StoreError, encode_run, no_results
-from pipeline.store.results_folder import RUNS, Store
+from pipeline.store.results_folder import Store
 from pipeline.store.stored_files import SUMMARY
+from pipeline.store.verification import RUNS
 
 
 def name_plainly(path: Path) -> str:

@@ -9,6 +9,7 @@ import damage_season
 import pytest
 from damage_season import KINDS, NO_TEXT, cut_in_future, run_batch
 from few import few
+from store_samples import read_current
 from verbs import ask_verb, run_slip
 
 from pipeline.batch.recordings import find_recordings
@@ -111,7 +112,7 @@ def test_a_name_that_is_no_text_passes_through_everything(odd: Path, tmp_path: P
     )
     assert rows["run"].to_list() == [run]
     assert to_location(rows["log"][0]) == odd
-    assert Store(out).read(run, "slip")["run"].unique().to_list() == [run]
+    assert read_current(Store(out), run, "slip")["run"].unique().to_list() == [run]
 
     # It is known again: by the ledger, and without it by the results.
     assert run_batch(odd.parent, out)[1]["unchanged"] == 1

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
-from hashlib import sha256
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from verbs import run_verb
 
-from pipeline.store.checksums import encode_checked
+from pipeline.store import Store
+from pipeline.store.files import hash_bytes
+from pipeline.store.manifests import FileEntry, encode_manifest
 
 RUN = "field/wide"
 VERBS = {
@@ -58,24 +60,20 @@ def change(content: object, place: Path_, odd: object, *, drop: bool) -> object:
 
 
 def store(results: Path, name: str, content: object) -> Path:
-    """Write a file of the run, and the manifest that agrees with it."""
-    home = results / "runs" / RUN
-    manifest = json.loads((home / "manifest.json").read_text())
-    data = json.dumps(content).encode()
-    path = home / manifest["folder"] / name
+    """Write a file of the run, bytes as they are, and the manifest that agrees with it."""
+    (manifest,) = Store(results).manifests()
+    data = content if isinstance(content, bytes) else json.dumps(content).encode()
+    path = manifest.path(name)
     path.unlink()
     path.write_bytes(data)
-    manifest.pop("checksum")
-    manifest["files"][name].update(sha256=sha256(data).hexdigest(), bytes=len(data))
-    (home / "manifest.json").write_bytes(encode_checked(manifest, indent=1))
+    files = {**manifest.files, name: FileEntry(sha256=hash_bytes(data), bytes=len(data))}
+    (manifest.home / "manifest.json").write_bytes(encode_manifest(replace(manifest, files=files)))
     return path
 
 
 def read(results: Path, name: str) -> dict[str, Any]:
     """The content of a file of the run."""
-    home = results / "runs" / RUN
-    manifest = json.loads((home / "manifest.json").read_text())
-    content: dict[str, Any] = json.loads((home / manifest["folder"] / name).read_text())
+    content: dict[str, Any] = json.loads(Store(results).manifests()[0].path(name).read_text())
     return content
 
 
@@ -124,13 +122,7 @@ def test_another_word_for_the_kind_of_vehicle_is_one_line(folder: Path) -> None:
 @pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{", b"[" * 100_000, b'{"a": NaN}', b"null"])
 def test_a_file_that_is_no_object(folder: Path, data: bytes) -> None:
     for name in ("summary.json", "diagnosis.json"):
-        path = store(folder / "results", name, {})
-        home = folder / "results" / "runs" / RUN
-        manifest = json.loads((home / "manifest.json").read_text())
-        manifest.pop("checksum")
-        manifest["files"][name].update(sha256=sha256(data).hexdigest(), bytes=len(data))
-        path.write_bytes(data)
-        (home / "manifest.json").write_bytes(encode_checked(manifest, indent=1))
+        store(folder / "results", name, data)
     for verb in (*VERBS["summary.json"], *VERBS["diagnosis.json"]):
         judge(folder, verb, "")
 
