@@ -291,14 +291,13 @@ class Store:
             StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
         """
         checked = check_table(name, frame)
-        valid, broken = checked.encode()
-        quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
-            replace_file(self.root / f"{name}.parquet", valid)
-            if broken is None:
-                quarantine.unlink(missing_ok=True)
-            else:
-                replace_file(quarantine, broken)
+            for prefix, data in zip(("", QUARANTINE), checked.encode(), strict=True):
+                path = self.root / f"{prefix}{name}.parquet"
+                if data is None:
+                    path.unlink(missing_ok=True)
+                else:
+                    replace_file(path, data)
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:
