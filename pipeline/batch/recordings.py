@@ -7,11 +7,11 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import TypeVar
 
 from pipeline.batch import BatchError
@@ -51,29 +51,6 @@ class Folder:
     files: Mapping[str, Path]
 
 
-class _Helper:
-    """Thread that can be abandoned: a call to a dead mount does not return."""
-
-    def __init__(self) -> None:
-        self._asked: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._answers: SimpleQueue[tuple[object, Exception | None]] = SimpleQueue()
-        threading.Thread(target=self._work, name="folders", daemon=True).start()
-
-    def ask(self, question: Callable[[], object], patience_s: float) -> object:
-        self._asked.put(question)
-        answer, error = self._answers.get(timeout=patience_s)
-        if error is not None:
-            raise error
-        return answer
-
-    def _work(self) -> None:
-        while True:
-            try:
-                self._answers.put((self._asked.get()(), None))
-            except Exception as error:  # noqa: BLE001 - it is raised where it was asked
-                self._answers.put((None, error))
-
-
 @dataclass
 class Looker:
     """Reads files and folders with a time limit.
@@ -85,17 +62,24 @@ class Looker:
 
     patience_s: float
     skipped: list[Skipped] = field(default_factory=list)
-    _helper: _Helper = field(default_factory=_Helper)
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
         """Result of a query about a path; None, with a note in `skipped`, if there is none."""
+        answer: Future[Answer] = Future()
+
+        def work() -> None:
+            try:
+                answer.set_result(question())
+            except Exception as error:  # noqa: BLE001 - it is raised where it was asked
+                answer.set_exception(error)
+
+        # A thread that can be abandoned: a call to a dead mount does not return.
+        threading.Thread(target=work, name="folders", daemon=True).start()
         try:
-            return self._helper.ask(question, self.patience_s)  # type: ignore[return-value]
-        except Empty:
-            self._helper = _Helper()
-            self.skip(
-                path, f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
-            )
+            return answer.result(self.patience_s)
+        except TimeoutError:
+            why = f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
+            self.skip(path, why)
         except OSError as error:
             self.skip(path, f"it cannot be read ({error.strerror or error})")
         return None
