@@ -254,28 +254,21 @@ _VERSION = 2
 """Version of the pooled files; increase it when their generation changes."""
 
 
-def refresh_pools(store: Store) -> bool:
+def refresh_pools(store: Store) -> None:
     """Update `datasets.parquet`, the catalogue, and the fleet model and trend if they were requested.
 
     Other batches may add runs meanwhile: it is repeated until the pooled runs are the current ones, so that
     the last batch to finish leaves the right tables.
-
-    Returns:
-        Whether any file was written.
     """
     notes = store.notes(_NOTES)
-    written = False
+    are_there = all((store.root / name).exists() for name in POOLED)
+    pooled = (notes.read(_NOTE) or {}).get("runs") if are_there else None
     for _ in range(_MOST_ROUNDS):
-        runs = _hash_runs(store)
-        are_there = all((store.root / name).exists() for name in POOLED)
-        if are_there and (notes.read(_NOTE) or {}).get("runs") == runs:
-            return written
+        if (runs := _hash_runs(store)) == pooled:
+            return
         update_datasets(store)
-        written = True
-        if _hash_runs(store) == runs:
-            notes.write(_NOTE, {"runs": runs})
-            return written
-    return written
+        notes.write(_NOTE, {"runs": runs})
+        pooled = runs
 
 
 def forget_pools(store: Store) -> None:

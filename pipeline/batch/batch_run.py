@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from pipeline.batch import Request, Shard
@@ -85,11 +85,12 @@ class Outcome:
     problems: tuple[SlipError, ...] = ()
     removed: int = 0
     notified: tuple[str, ...] = ()
-    counts: Mapping[str, int] = field(init=False)
 
-    def __post_init__(self) -> None:
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many logs came out how."""
         states = [line.state for line in self.lines]
-        object.__setattr__(self, "counts", {state: states.count(state) for state in STATES})
+        return {state: states.count(state) for state in STATES}
 
     @property
     def has_failed(self) -> bool:

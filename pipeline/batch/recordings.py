@@ -44,11 +44,13 @@ class Folder:
         path: absolute, links resolved.
         folders: subfolders by name; absolute, links resolved.
         files: regular files, likewise.
+        identity: that no other folder has.
     """
 
     path: Path
     folders: Mapping[str, Path]
     files: Mapping[str, Path]
+    identity: tuple[int, int]
 
 
 @dataclass
@@ -93,11 +95,10 @@ class Looker:
         seen: set[tuple[int, int]] = set()
 
         def look(path: Path) -> tuple[Folder, list[Path], int] | None:
-            looked = self._look_into(path)
-            if looked is None or looked[0] in seen:
+            folder = self._look_into(path)
+            if folder is None or folder.identity in seen:
                 return None
-            seen.add(looked[0])
-            folder = looked[1]
+            seen.add(folder.identity)
             return folder, list(folder.folders.values()), len(folder.folders) + len(folder.files)
 
         return walk_tree(top, look, self.skip)
@@ -123,18 +124,17 @@ class Looker:
             if self.ask(inner, inner.exists):
                 yield from self._expand(inner, parts[1:])
             return
-        looked = self._look_into(base)
-        if looked is not None:
-            here = {**looked[1].folders, **(looked[1].files if len(parts) == 1 else {})}
+        if (inside := self._look_into(base)) is not None:
+            here = {**inside.folders, **(inside.files if len(parts) == 1 else {})}
             for name in sorted(fnmatch.filter(here, parts[0])):
                 yield from self._expand(here[name], parts[1:])
 
-    def _look_into(self, folder: Path) -> tuple[tuple[int, int], Folder] | None:
-        """Contents of a folder, and its unique identity."""
+    def _look_into(self, folder: Path) -> Folder | None:
+        """Contents of a folder."""
         listed = self.ask(folder, lambda: _list(folder))
         if listed is None:
             return None
-        number, entries = listed
+        identity, entries = listed
         kinds: dict[str, dict[str, Path]] = {"folder": {}, "file": {}}
         for entry in sorted(entries, key=lambda entry: entry.name):
             # Copies in progress and caches have hidden names.
@@ -152,7 +152,7 @@ class Looker:
             # A link that leads nowhere, of another suffix, was one to neither a log nor a folder.
             elif entry.name.endswith(SUFFIXES) or (kind in _DEAD and not path.suffix):
                 self.skip(path, kind)
-        return number, Folder(folder, kinds["folder"], kinds["file"])
+        return Folder(folder, kinds["folder"], kinds["file"], identity)
 
 
 _DEAD = (_TO_NOTHING, _TO_ITSELF) = ("it is a link to nothing", "it is a link to itself")

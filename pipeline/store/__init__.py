@@ -15,13 +15,12 @@ if TYPE_CHECKING:
     from pipeline.store.checksums import LOG_NOTES
     from pipeline.store.files import hold_lock, make_folder, replace_file, temporary_beside
     from pipeline.store.generation import Generation
-    from pipeline.store.manifests import JSON, MANIFEST, Manifest, load_manifest
+    from pipeline.store.manifests import JSON, MANIFEST, Manifest
     from pipeline.store.names import (
         Sample,
         StoreError,
         TableEntry,
         Tally,
-        check_home,
         date_runs,
         encode_run,
         name_damage,
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
         check_table,
     )
     from pipeline.store.results_folder import Store, list_old
-    from pipeline.store.stored_files import SUMMARY, convert_stored, decode_stored, read_stored
+    from pipeline.store.stored_files import SUMMARY, convert_stored, read_stored
     from pipeline.store.stored_runs import (
         ANALYZE_FIRST,
         DIAGNOSIS,

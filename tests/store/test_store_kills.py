@@ -7,15 +7,14 @@ import os
 import random
 import resource
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
+from disks import mount_disk, remount
 from faults import DISK, MEMORY, Fault, arm, draw_faults
 from few import few
 from store_samples import make_slip, read_seed, write_generation
@@ -169,37 +168,22 @@ def test_errors_of_the_caller_stay_what_they_are(store: Store) -> None:
         raise FileNotFoundError(errno.ENOENT, "the log")
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 512 kB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(place)]
-    try:
-        mounted = subprocess.run(mount, capture_output=True, check=False)
-    except FileNotFoundError:
-        pytest.skip("there is no mount command")
-    if mounted.returncode:
-        pytest.skip("mounting a small disk is not allowed here")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
-
-
-def test_a_disk_that_is_really_full_or_read_only(small_disk: Path) -> None:
-    store = Store(small_disk / "results")
-    write_generation(store, RUN, "old", OLD)
-    with pytest.raises(StoreError) as caught, store.open_generation(RUN, "new") as generation:
-        generation.write_table("slip", make_slip(RUN, NEW, rows=20_000))
-    assert caught.value.code == "disk_full"
-    assert read_seed(store, RUN) == OLD
-    assert store.examine().problems == ()
-    write_generation(store, RUN, "new", NEW)
-    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    with pytest.raises(StoreError) as caught:
-        write_generation(store, RUN, "newer", NEW + 1)
-    assert caught.value.code == "read_only"
-    assert read_seed(store, RUN) == NEW
-    assert store.query("SELECT count(*) AS n FROM slip")["n"].to_list() == [500]
+def test_a_disk_that_is_really_full_or_read_only(tmp_path: Path) -> None:
+    with mount_disk(tmp_path / "disk", "512k") as place:
+        store = Store(place / "results")
+        write_generation(store, RUN, "old", OLD)
+        with pytest.raises(StoreError) as caught, store.open_generation(RUN, "new") as generation:
+            generation.write_table("slip", make_slip(RUN, NEW, rows=20_000))
+        assert caught.value.code == "disk_full"
+        assert read_seed(store, RUN) == OLD
+        assert store.examine().problems == ()
+        write_generation(store, RUN, "new", NEW)
+        remount(place, "ro")
+        with pytest.raises(StoreError) as caught:
+            write_generation(store, RUN, "newer", NEW + 1)
+        assert caught.value.code == "read_only"
+        assert read_seed(store, RUN) == NEW
+        assert store.query("SELECT count(*) AS n FROM slip")["n"].to_list() == [500]
 
 
 def test_copies_where_links_are_impossible(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

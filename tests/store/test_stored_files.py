@@ -4,18 +4,16 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from store_samples import forge_file
 from verbs import run_verb
 
 from pipeline.store import Store
-from pipeline.store.files import hash_bytes
-from pipeline.store.manifests import FileEntry, encode_manifest
 
 RUN = "field/wide"
 VERBS = {
@@ -61,14 +59,8 @@ def change(content: object, place: Path_, odd: object, *, drop: bool) -> object:
 
 def store(results: Path, name: str, content: object) -> Path:
     """Write a file of the run, bytes as they are, and the manifest that agrees with it."""
-    (manifest,) = Store(results).manifests()
     data = content if isinstance(content, bytes) else json.dumps(content).encode()
-    path = manifest.path(name)
-    path.unlink()
-    path.write_bytes(data)
-    files = {**manifest.files, name: FileEntry(sha256=hash_bytes(data), bytes=len(data))}
-    (manifest.home / "manifest.json").write_bytes(encode_manifest(replace(manifest, files=files)))
-    return path
+    return forge_file(Store(results).manifests()[0], name, data)
 
 
 def read(results: Path, name: str) -> dict[str, Any]:
