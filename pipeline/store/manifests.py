@@ -60,7 +60,7 @@ class Manifest:
 
     run: str
     key: str
-    number: Annotated[int, msgspec.Meta(ge=1, lt=10**18)]
+    number: Annotated[int, msgspec.Meta(ge=1)]
     tables: Mapping[str, TableEntry]
     files: Mapping[str, FileEntry]
     details: Mapping[str, Any]

@@ -111,7 +111,7 @@ LONGEST_PART = 120
 """Bytes of one part of a path; file systems allow 255, encrypted ones 143."""
 
 _HASH_DIGITS = 16
-GENERATION = re.compile(r"generation-([1-9][0-9]{0,17})")
+GENERATION = re.compile(r"generation-([1-9][0-9]*)")
 """Name of the folder of a run's generation, with its number."""
 
 _RESERVED = re.compile(rf"manifest\.json|latest|{GENERATION.pattern}", re.IGNORECASE)

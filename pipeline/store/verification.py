@@ -133,15 +133,9 @@ class _Examiner:
         inside = self._names[start : bisect_left(self._names, f"{folder}0", start)]
         extra = {name.removeprefix(f"{folder}/") for name in inside} - manifest.files.keys()
         told = [(name, "extra_file", "the file was not written with the others") for name in sorted(extra)]
-        told += [
-            (
-                name,
-                *self._judge_file(
-                    manifest.folder / name, entry.sha256, is_there=f"{folder}/{name}" in inside
-                ),
-            )
-            for name, entry in sorted(manifest.files.items())
-        ]
+        for name, entry in sorted(manifest.files.items()):
+            path, is_there = manifest.folder / name, f"{folder}/{name}" in inside
+            told.append((name, *self._judge_file(path, entry.sha256, is_there=is_there)))
         for name, code, what in told:
             if code:
                 yield Problem(manifest.run, manifest.folder / name, code, what, home)
