@@ -215,8 +215,8 @@ def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int
     try:
         refresh_pools(store)
         if request.pruning is not None:
-            removed, found = prune_results(store, request.pruning)
-            problems += found
+            removed, unmet = prune_results(store, request.pruning)
+            problems += unmet
     except SlipError as error:
         problems.append(error)
     every = {str(problem): problem for problem in (*problems, *store.survey().errors)}

@@ -187,8 +187,8 @@ def folder_of(home: Path, number: int) -> Path:
 
 def list_generations(home: Path) -> dict[int, Path]:
     """Folders of a run's generations by their numbers, the newest first."""
-    found = [(int(name[1]), path) for path in home.glob("*") if (name := GENERATION.fullmatch(path.name))]
-    return dict(sorted(found, reverse=True))
+    folders = [(int(name[1]), path) for path in home.glob("*") if (name := GENERATION.fullmatch(path.name))]
+    return dict(sorted(folders, reverse=True))
 
 
 def encode_manifest(manifest: Manifest) -> bytes:

@@ -75,7 +75,7 @@ class _Examiner:
 
     def examine(self) -> Examination:
         problems = list(self._unread)
-        for home in self._find_homes():
+        for home in self._list_runs():
             problems += self._examine_run(home)
         problems += self._examine_notes()
         of_all = tuple(name for name in self._names if is_file_name(name) and "/" not in name)
@@ -84,7 +84,7 @@ class _Examiner:
     def _leave_out(self, path: Path, why: str) -> None:
         self._unread.append(Problem(run="", path=path, code="left_out", what=why))
 
-    def _find_homes(self) -> list[str]:
+    def _list_runs(self) -> list[str]:
         """Folders of runs, which have a manifest, or a link that only those with one had."""
         parts = [name.rpartition("/") for name in self._names if name.startswith(f"{RUNS}/")]
         return sorted(
@@ -132,11 +132,11 @@ class _Examiner:
         start = bisect_left(self._names, f"{folder}/")
         inside = self._names[start : bisect_left(self._names, f"{folder}0", start)]
         extra = {name.removeprefix(f"{folder}/") for name in inside} - manifest.files.keys()
-        told = [(name, "extra_file", "the file was not written with the others") for name in sorted(extra)]
+        checked = [(name, "extra_file", "the file was not written with the others") for name in sorted(extra)]
         for name, entry in sorted(manifest.files.items()):
             path, is_there = manifest.folder / name, f"{folder}/{name}" in inside
-            told.append((name, *self._judge_file(path, entry.sha256, is_there=is_there)))
-        for name, code, what in told:
+            checked.append((name, *self._judge_file(path, entry.sha256, is_there=is_there)))
+        for name, code, what in checked:
             if code:
                 yield Problem(manifest.run, manifest.folder / name, code, what, home)
 
