@@ -1,12 +1,12 @@
 """Everything that is shown is of the model that stands there: map, commands, where it fails, what to add."""
 
 import json
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from store_samples import forge_file
 from workbench_server import RUN, Workbench
 
 from pipeline.estimation import Input
@@ -16,7 +16,6 @@ from pipeline.run import load_motion_run
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Store
-from pipeline.store.checksums import encode_checked
 
 Rows = dict[str, dict[str, list[float | None]]]
 
@@ -30,13 +29,9 @@ def finite(values: list[float | None]) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def write_diagnosis(workbench: Workbench, told: dict[str, object]) -> None:
-    home = workbench.results / "runs/field/hidden"
-    manifest = json.loads((home / "manifest.json").read_text())
-    del manifest["checksum"]
-    content = json.dumps(told).encode()
-    (home / manifest["folder"] / "diagnosis.json").write_bytes(content)
-    manifest["files"]["diagnosis.json"] = {"bytes": len(content), "sha256": sha256(content).hexdigest()}
-    (home / "manifest.json").write_bytes(encode_checked(manifest))
+    manifest = Store(workbench.results).manifest("field/hidden")
+    assert manifest is not None
+    forge_file(manifest, "diagnosis.json", json.dumps(told).encode())
 
 
 def test_map_and_commands_show_what_the_model_leaves_of_the_slip(workbench: Workbench) -> None:
