@@ -3,15 +3,18 @@
 import math
 import tomllib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Literal, get_args
 
-import msgspec
 import numpy as np
 
 from pipeline.core import Floats, SlipError, guess_names
+
+Series = Mapping[str, Floats]
+"""Quantities of the run by name, shape (n,) each."""
+Field = Floats | float | str | list[str]
 
 
 @dataclass(frozen=True)
@@ -23,15 +26,15 @@ class Q:
     offset: float = 0.0
     whole: bool = False
 
+    def __call__(self, series: Series) -> Floats:
+        """Its values, shape (n,)."""
+        values = series[self.name]
+        if (self.gain, self.offset) != (1.0, 0.0):
+            values = self.gain * values + self.offset
+        return np.floor(values) if self.whole else values
 
-@dataclass(frozen=True)
-class Json:
-    """A text with a JSON object of quantities by key."""
 
-    numbers: Mapping[str, Q]
-
-
-Value = Q | Json | tuple[Q, ...] | str | list[str] | float
+Value = tuple[Q, ...] | Callable[[Series], Field] | str | list[str] | float
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Published:
     Attributes:
         topic, type_name: where and what.
         source: whose times and quantities it has, an entry of `SOURCES`.
-        fields: by field path a quantity, several for an array, a text of them, or a constant.
+        fields: by field path a quantity, several for an array, what is made of some, or a constant.
         every: one message in so many is published.
         stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
     """
@@ -324,30 +327,6 @@ def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
 #
 # The names are those of the published recordings and of common robot configurations.
 
-DriveForm = Literal[
-    "joint_state", "float_sides", "twist", "twist_stamped", "ackermann", "float_speed_steering"
-]
-PoseContent = Literal["odometry", "pose_stamped", "pose_covariance", "tf"]
-
-
-@dataclass(frozen=True)
-class DriveTopic:
-    """Topics of a command or of measured wheels: one, or a pair (left, right) or (speed, steering).
-
-    No encoder reports twists.
-    """
-
-    form: DriveForm
-    topics: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class PoseTopic:
-    """Topic of the pose."""
-
-    form: PoseContent
-    topic: str
-
 
 @dataclass(frozen=True)
 class Layout:
@@ -355,30 +334,16 @@ class Layout:
 
     Attributes:
         kind: vehicles that have it.
-        commands: what was asked, possibly on several topics.
-        wheels: what the encoders measured; empty when the robot does not publish it.
-        pose: where the localization reports.
-        imu: topic of the inertial unit, empty when there is none.
-        joints: names of the wheel joints of JointState messages, with ``{}`` for ``front_left`` and the like.
-        topics: everything in the log of a platform; nothing else is written then.
+        topics: topics, or rows of them as `topics.read_topic` takes them.
     """
 
     kind: Kind
-    commands: tuple[DriveTopic, ...]
-    wheels: tuple[DriveTopic, ...]
-    pose: PoseTopic
-    imu: str = ""
-    joints: str = "{}_wheel"
-    topics: tuple[Published, ...] = ()
+    topics: tuple[Published | Mapping[str, Any], ...]
 
 
-def _read_layout(given: dict[str, Any]) -> Layout:
-    commands = msgspec.convert(given.pop("commands"), tuple[DriveTopic, ...])
-    wheels = msgspec.convert(given.pop("wheels", []), tuple[DriveTopic, ...])
-    return Layout(given.pop("kind"), commands, wheels, PoseTopic(**given.pop("pose")), **given)
-
-
-LAYOUTS: dict[str, Layout] = {name: _read_layout(given) for name, given in read_facts("layouts.toml").items()}
+LAYOUTS: dict[str, Layout] = {
+    name: Layout(given["kind"], tuple(given["topics"])) for name, given in read_facts("layouts.toml").items()
+}
 
 
 def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:

@@ -3,32 +3,35 @@
 What says when and with which quantities a topic is sent is an entry of `SOURCES`.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from pipeline.core import Floats, rigid
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.facts import (
-    DriveTopic,
-    Json,
+    Field,
     Layout,
-    PoseTopic,
     Published,
     Q,
+    Series,
     SimulateError,
     Value,
     Vehicle,
 )
-from pipeline.simulate.messages import LATE_S, Field, Messages, SimulatedRun
-from pipeline.simulate.scenario import Scenario
+from pipeline.simulate.messages import SimulatedRun, integrate_odometry
+from pipeline.simulate.programs import make_wishes
+from pipeline.simulate.scenario import Messages, Scenario
 
-Series = dict[str, Floats]
-Sampled = tuple[Floats, Floats, Series]
+Sampled = tuple[Floats, Floats, dict[str, Floats]]
 """Stamps and times in the log [s], shape (n,), and quantities by name."""
 
+Reading = TypeVar("Reading")
+
+LATE_S = 0.002
+"""From a reading to the recorder [s]."""
 _TF_PERIOD_S, _FUTURE_S = 0.05, 0.1
 _TURN = 2.0 * np.pi
 _COMPASS_OFF_RAD = 0.7
@@ -50,26 +53,17 @@ def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Messages]:
             known[one.source] = SOURCES[one.source](run)
         stamp, log, series = known[one.source]
         rows = slice(None, None, one.every)
-        fields = {path: _fill(value, series, rows) for path, value in one.fields.items()}
+        taken = {name: values[rows] for name, values in series.items()}
+        fields = {path: _fill(value, taken) for path, value in one.fields.items()}
         header = None if one.stamp == "none" else stamp[rows]
         tables.append(Messages(one.topic, one.type_name, log[rows], header, fields, one.stamp))
     return tables
 
 
-def _fill(value: Value, series: Series, rows: slice) -> Field:
-    if isinstance(value, Json):
-        columns = [_take(each, series, rows).tolist() for each in value.numbers.values()]
-        return [json.dumps(dict(zip(value.numbers, row, strict=True))) for row in zip(*columns, strict=True)]
+def _fill(value: Value, series: Series) -> Field:
     if isinstance(value, tuple):
-        return np.stack([_take(each, series, rows) for each in value], axis=1)
-    return _take(value, series, rows) if isinstance(value, Q) else value
-
-
-def _take(quantity: Q, series: Series, rows: slice) -> Floats:
-    values = series[quantity.name][rows]
-    if (quantity.gain, quantity.offset) != (1.0, 0.0):
-        values = quantity.gain * values + quantity.offset
-    return np.floor(values) if quantity.whole else values
+        return np.stack([each(series) for each in value], axis=1)
+    return value(series) if callable(value) else value
 
 
 def _of_command(run: SimulatedRun) -> Sampled:
@@ -91,9 +85,7 @@ def _of_command(run: SimulatedRun) -> Sampled:
 
 def read_wheels(run: SimulatedRun) -> Sampled:
     """When and what the encoders say."""
-    wheels = run.wheels
-    if wheels is None:
-        raise refuse_missing("encoders")
+    wheels = need(run.wheels, "encoders")
     speed, rate = apply_ideal_model(run.scenario.vehicle, wheels.left, wheels.right, wheels.steering)
     series = {
         name: getattr(wheels, name) for name in ("left", "right", "left_angle", "right_angle", "steering")
@@ -136,16 +128,34 @@ def _of_relocalization(run: SimulatedRun) -> Sampled:
 
 
 def _of_imu(run: SimulatedRun) -> Sampled:
-    if run.imu is None:
-        raise refuse_missing("an inertial unit")
-    series = {f"rate_{axis}": run.imu.rates[:, i] for i, axis in enumerate("xyz")}
-    series |= {f"force_{axis}": run.imu.accelerations[:, i] for i, axis in enumerate("xyz")}
-    path = run.truth.path
-    _, turn = rigid.interpolate_poses(run.imu.time_s, path.time_s, path.position, path.quaternion)
+    imu, path = need(run.imu, "an inertial unit"), run.truth.path
+    series = {f"rate_{axis}": imu.rates[:, i] for i, axis in enumerate("xyz")}
+    series |= {f"force_{axis}": imu.accelerations[:, i] for i, axis in enumerate("xyz")}
+    _, turn = rigid.interpolate_poses(imu.time_s, path.time_s, path.position, path.quaternion)
     start = np.broadcast_to(rigid.quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
     turn = rigid.multiply_quaternions(start, turn)
     series |= {f"attitude_{axis}": turn[:, i] for i, axis in enumerate("xyzw")}
-    return run.imu.time_s, run.imu.time_s + LATE_S, series
+    return imu.time_s, imu.time_s + LATE_S, series
+
+
+def _of_decoy(run: SimulatedRun) -> Sampled:
+    """Commands that never reach the controller."""
+    wished = make_wishes(run.scenario, "decoy")
+    series = {"speed": wished.speed_mps, "yaw_rate": wished.turn, "sideways": wished.sideways}
+    return wished.time_s, wished.time_s, series
+
+
+def of_odometry(run: SimulatedRun) -> Sampled:
+    """Where the wheels alone say that the vehicle is."""
+    stamp, log, series = read_wheels(run)
+    path = integrate_odometry(run.scenario.vehicle, need(run.wheels, "encoders"), start=(0.0, 0.0, 0.0))
+    return stamp, log, series | name_pose(path.position[:-1], path.quaternion[:-1])
+
+
+def _of_state(run: SimulatedRun) -> Sampled:
+    """Which part of the run counts, if a person drives first."""
+    time = np.arange(0.0, run.scenario.duration_s, 0.1)
+    return time, time, {"counts": (time >= (run.scenario.recording.hand_driven_s or 0.0)).astype(np.float64)}
 
 
 def _once(run: SimulatedRun) -> Sampled:
@@ -153,20 +163,26 @@ def _once(run: SimulatedRun) -> Sampled:
     return np.zeros(1), np.zeros(1), {}
 
 
-def name_pose(position: Floats, quaternion: Floats) -> Series:
+def name_pose(position: Floats, quaternion: Floats) -> dict[str, Floats]:
     """Quantities of poses."""
     named = {axis: position[:, i] for i, axis in enumerate("xyz")}
     return named | {f"q{axis}": quaternion[:, i] for i, axis in enumerate("xyzw")}
 
 
-def refuse_missing(what: str) -> SimulateError:
-    """The error for a topic whose sensor the scenario leaves out."""
-    return SimulateError(
-        "encoders_needed",
-        f"the layout has {what}, and the scenario has none",
-        where="layout",
-        hint="Choose a case with encoders and an inertial unit",
-    )
+def need(reading: Reading | None, what: str) -> Reading:
+    """What a sensor read.
+
+    Raises:
+        SimulateError: ``encoders_needed``, the scenario leaves it out.
+    """
+    if reading is None:
+        raise SimulateError(
+            "encoders_needed",
+            f"the layout has {what}, and the scenario has none",
+            where="layout",
+            hint="Choose a case with encoders and an inertial unit",
+        )
+    return reading
 
 
 SOURCES: dict[str, Callable[[SimulatedRun], Sampled]] = {
@@ -176,6 +192,9 @@ SOURCES: dict[str, Callable[[SimulatedRun], Sampled]] = {
     "tracking": _of_tracking,
     "relocalization": _of_relocalization,
     "imu": _of_imu,
+    "decoy": _of_decoy,
+    "odometry": of_odometry,
+    "state": _of_state,
     "once": _once,
 }
 
@@ -184,43 +203,34 @@ _XYZ, _XYZW = "xyz", "xyzw"
 Fields = dict[str, Value]
 
 
+_TWIST = {"linear.x": "speed", "linear.y": "sideways", "angular.z": "yaw_rate"}
+
+
 def pose_fields(position: str, orientation: str) -> dict[str, Q]:
     """Fields of a pose."""
     fields = {f"{position}.{axis}": Q(axis) for axis in _XYZ}
     return fields | {f"{orientation}.{axis}": Q(f"q{axis}") for axis in _XYZW}
 
 
+_POSE_IN_POSE = pose_fields("pose.pose.position", "pose.pose.orientation")
+
+
 def twist(
-    topic: str,
-    *,
-    stamped: bool = False,
-    source: str = "command",
-    sideways: bool = False,
-    frame: str | None = None,
+    topic: str, *, stamped: bool = False, source: str = "command", frame: str | None = None
 ) -> Published:
     """A body command; a ``wish`` is one that never reaches the controller."""
-    prefix, name = ("twist.", "TwistStamped") if stamped else ("", "Twist")
-    fields: Fields = {f"{prefix}linear.x": Q("speed"), f"{prefix}angular.z": Q("yaw_rate")}
-    if sideways:
-        fields[f"{prefix}linear.y"] = Q("sideways")
+    prefix, name, stamp = ("twist.", "TwistStamped", "header") if stamped else ("", "Twist", "none")
+    fields: Fields = {f"{prefix}{path}": Q(name) for path, name in _TWIST.items()}
     if frame is not None:
         fields["header.frame_id"] = frame
-    return Published(
-        topic, f"geometry_msgs/msg/{name}", source, fields, stamp="header" if stamped else "none"
-    )
+    return Published(topic, f"geometry_msgs/msg/{name}", source, fields, stamp=stamp)
 
 
-def odometry(topic: str, source: str, parent: str, child: str, *, sideways: bool = False) -> Published:
+def odometry(topic: str, source: str, parent: str, child: str) -> Published:
     """An odometry; one of the wheels says their speed as well."""
-    fields: Fields = {
-        **pose_fields("pose.pose.position", "pose.pose.orientation"),
-        "header.frame_id": parent,
-        "child_frame_id": child,
-    }
+    fields: Fields = {**_POSE_IN_POSE, "header.frame_id": parent, "child_frame_id": child}
     if source != "localization":
-        fields |= {"twist.twist.linear.x": Q("speed"), "twist.twist.angular.z": Q("yaw_rate")}
-        if sideways:
-            fields["twist.twist.linear.y"] = Q("sideways")
+        fields |= {f"twist.twist.{path}": Q(name) for path, name in _TWIST.items()}
     return Published(topic, "nav_msgs/msg/Odometry", source, fields)
 
 
@@ -235,32 +245,41 @@ def transform(topic: str, source: str, parent: str, child: str) -> Published:
     return Published(topic, "tf2_msgs/msg/TFMessage", source, fields)
 
 
-def mecanum_joints(topic: str, names: Mapping[str, str]) -> Published:
-    """Joint states of four wheels that differ, named by their place (`CORNERS`)."""
-    values: Fields = {
-        "name": list(names.values()),
-        "position": tuple(Q(f"{corner}_angle") for corner in names),
-        "velocity": tuple(Q(corner) for corner in names),
-    }
-    return Published(topic, "sensor_msgs/msg/JointState", "wheels", values)
+def mount(child: str, position: Sequence[float] = (0.0, 0.0, 0.0), yaw: float = 0.0) -> Published:
+    """Where a sensor is on the vehicle."""
+    made = transform("/tf_static", "once", "base_link", child)
+    series = name_pose(np.array([position]), rigid.quaternions_from_yaw(np.array([yaw])))
+    known = {path: float(one(series)[0]) for path, one in made.fields.items() if isinstance(one, Q)}
+    return replace(made, fields={**made.fields, **known})
 
 
-def joints(topic: str, template: str, places: Sequence[str], fields: str = "both") -> Published:
-    """Joint states of the wheels; ``fields`` may be ``position`` alone."""
-    names = [name_joint(template, corner) for corner in places]
-    turned = tuple(Q("steering") if p.startswith("steer") else Q(f"{_side(p)}_angle") for p in places)
-    rolling = tuple(Q("zero") if p.startswith("steer") else Q(_side(p)) for p in places)
-    values: Fields = {"name": names, "position": turned}
-    return Published(
-        topic,
-        "sensor_msgs/msg/JointState",
-        "wheels",
-        values if fields == "position" else values | {"velocity": rolling},
-    )
+def joints(
+    topic: str,
+    template: str = "{}_wheel",
+    places: Sequence[str] = (),
+    fields: str = "both",
+    source: str = "wheels",
+    *,
+    each: bool = False,
+) -> Published:
+    """Joint states of the wheels.
 
-
-def _side(corner: str) -> str:
-    return corner.rsplit("_", 1)[-1]
+    Args:
+        topic: where.
+        template: names of the joints, with ``{}`` for a place.
+        places: ``front_left`` and the like, ``steer_front_left`` of a joint that steers.
+        fields: ``position`` or ``velocity`` alone, or both.
+        source: of their motion.
+        each: whether wheels of a side differ, as on a vehicle that moves sideways.
+    """
+    named = {place: place if each else place.rsplit("_", 1)[-1] for place in places}
+    steers = [place.startswith("steer") for place in places]
+    turned = tuple(Q("steering" if s else f"{named[p]}_angle") for p, s in zip(places, steers, strict=True))
+    rolling = tuple(Q("zero" if s else named[p]) for p, s in zip(places, steers, strict=True))
+    values: Fields = {"name": [name_joint(template, place) for place in places]}
+    values |= {"position": turned} if fields != "velocity" else {}
+    values |= {"velocity": rolling} if fields != "position" else {}
+    return Published(topic, "sensor_msgs/msg/JointState", source, values)
 
 
 def name_joint(template: str, corner: str) -> str:
@@ -282,64 +301,90 @@ def imu(topic: str, *, attitude: bool = False, is_unknown: bool = False) -> Publ
     return Published(topic, "sensor_msgs/msg/Imu", "imu", fields)
 
 
-def pose_with_covariance(topic: str, every: int) -> Published:
-    """A slow localization."""
-    fields: Fields = {
-        **pose_fields("pose.pose.position", "pose.pose.orientation"),
-        "header.frame_id": "map",
-    }
-    name = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    return Published(topic, name, "localization", fields, every=every)
+def pose_stamped(topic: str) -> Published:
+    """A localization that says nothing of its errors."""
+    fields: Fields = {**pose_fields("pose.position", "pose.orientation"), "header.frame_id": "map"}
+    return Published(topic, "geometry_msgs/msg/PoseStamped", "localization", fields)
+
+
+def pose_with_covariance(topic: str, every: int = 1) -> Published:
+    """A localization, perhaps a slow one."""
+    fields: Fields = {**_POSE_IN_POSE, "header.frame_id": "map"}
+    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    return Published(topic, kind, "localization", fields, every=every)
+
+
+def number(topic: str, source: str, quantity: str) -> Published:
+    """One quantity alone."""
+    return Published(topic, "std_msgs/msg/Float64", source, {"data": Q(quantity)}, stamp="none")
+
+
+FORMS: dict[str, Callable[..., Published]] = {
+    made.__name__: made
+    for made in (
+        *(twist, odometry, transform, mount, joints),
+        *(imu, pose_stamped, pose_with_covariance, number),
+    )
+}
+"""What a row of a layout may be, by the key with its topic."""
+
+
+def read_topic(row: Mapping[str, Any]) -> Published:
+    """The topic of a row: one of `FORMS` with what it takes, or type, source, constants and quantities."""
+    given = dict(row)
+    for name in FORMS.keys() & row:
+        return FORMS[name](given.pop(name), **given)
+    fields: Fields = given.pop("constants", {})
+    fields = fields | {path: _read_value(one) for path, one in given.pop("quantities", {}).items()}
+    return Published(given.pop("topic"), given.pop("type"), given.pop("source"), fields, **given)
+
+
+def _read_value(given: Any) -> Q | tuple[Q, ...]:  # noqa: ANN401 - as a file has it
+    """A quantity by its name, perhaps with a gain; or several."""
+    if isinstance(given, list):
+        return tuple(Q(one) if isinstance(one, str) else Q(**one) for one in given)
+    return Q(given) if isinstance(given, str) else Q(**given)
 
 
 def list_topics(layout: Layout, scenario: Scenario) -> tuple[Published, ...]:
-    """Topics of a log in a layout that says forms of messages only."""
-    sensor = scenario.pose
-    topics = [one for each in layout.commands for one in _list_drive(each, "command", layout, scenario)]
-    if scenario.encoders is not None:
-        topics += [one for each in layout.wheels for one in _list_drive(each, "wheels", layout, scenario)]
-    topics += _list_pose(layout.pose, sensor.child_frame)
-    if layout.pose.form == "tf" and scenario.imu is not None:
-        topics.append(_mount("imu_link", np.zeros(3), 0.0))
-    if sensor.child_frame != "base_link":
-        position = np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0])
-        topics.append(_mount(sensor.child_frame, position, sensor.mount_yaw_rad))
-    if layout.imu and scenario.imu is not None:
-        topics.append(imu(layout.imu, is_unknown=True))
-    return tuple(topics)
+    """Topics of a log in a layout, without those whose sensor the scenario leaves out."""
+    sensor, recording = scenario.pose, scenario.recording
+    missing = set() if scenario.encoders is not None else {"wheels", "odometry"}
+    missing |= set() if scenario.imu is not None else {"imu"}
+    topics: list[Published] = []
+    for row in layout.topics:
+        if isinstance(row, Published):
+            topics.append(row)
+            continue
+        if "mount" not in row or scenario.imu is not None:
+            topics.append(read_topic(_fit_row(row, scenario)))
+        if "odometry" in row and sensor.child_frame != "base_link":
+            position = (sensor.mount_x_m, sensor.mount_y_m, 0.0)
+            topics.append(mount(sensor.child_frame, position, sensor.mount_yaw_rad))
+    if recording.hand_driven_s is not None:
+        fields: Fields = {"data": lambda series: np.where(series["counts"], "calib", "idle").tolist()}
+        topics.append(Published("/drive/calib_state", "std_msgs/msg/String", "state", fields, stamp="none"))
+    if recording.decoys in {"commands", "both"}:
+        topics.append(twist("/navigation/cmd_vel", source="decoy"))
+    if recording.decoys in {"odometry", "both"}:
+        topics.append(odometry("/platform/odom", "odometry", "odom", "base_link"))
+    return tuple(one for one in topics if one.source not in missing)
 
 
-def _list_drive(one: DriveTopic, source: str, layout: Layout, scenario: Scenario) -> list[Published]:
-    topic, vehicle = one.topics[0], scenario.vehicle
-    if one.form in {"twist", "twist_stamped"}:
-        stamped = one.form == "twist_stamped"
-        frame = "base_link" if stamped else None
-        return [twist(topic, stamped=stamped, sideways=vehicle.moves_sideways, frame=frame)]
-    if one.form == "ackermann":
-        fields: Fields = {"drive.speed": Q("speed"), "drive.steering_angle": Q("steering")}
-        return [Published(topic, "ackermann_msgs/msg/AckermannDriveStamped", source, fields)]
-    if one.form != "joint_state":
-        names = ("left", "right") if one.form == "float_sides" else ("speed", "steering")
-        return [
-            Published(each, "std_msgs/msg/Float64", source, {"data": Q(name)}, stamp="none")
-            for each, name in zip(one.topics, names, strict=True)
-        ]
+def _fit_row(row: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    """A row with what a vehicle and its sensors decide: joints, and the frame of the pose."""
+    vehicle = scenario.vehicle
+    if "odometry" in row:
+        return {**row, "child": scenario.pose.child_frame}
+    if "joints" not in row:
+        return dict(row)
     places = _list_places(vehicle)
-    if source == "command":
+    if row.get("source") == "command":
         # A command lists the rear wheels first and an encoder the front ones: only names can tell them apart.
-        asked = joints(topic, layout.joints, places[::-1])
-        return [replace(asked, source=source, fields=_leave_out(asked.fields, "position"))]
-    if vehicle.moves_sideways:
-        made = mecanum_joints(topic, {corner: name_joint(layout.joints, corner) for corner in places})
-    else:
-        made = joints(topic, layout.joints, places)
+        return {**row, "places": places[::-1], "fields": "velocity"}
     report = "both" if scenario.encoders is None else scenario.encoders.report
-    lacks = {"position": "velocity", "velocity": "" if vehicle.kind == "ackermann" else "position"}
-    return [replace(made, fields=_leave_out(made.fields, lacks.get(report, "")))]
-
-
-def _leave_out(fields: Mapping[str, Value], name: str) -> Fields:
-    return {path: value for path, value in fields.items() if path != name}
+    fields = "both" if vehicle.kind == "ackermann" and report == "velocity" else report
+    return {**row, "places": places, "fields": fields, "each": vehicle.moves_sideways}
 
 
 def _list_places(vehicle: Vehicle) -> list[str]:
@@ -349,25 +394,3 @@ def _list_places(vehicle: Vehicle) -> list[str]:
     several = [f"axle_{number}_" for number in range(1, vehicle.wheels_per_side + 1)]
     axles = {1: [""], 2: ["front_", "rear_"]}.get(vehicle.wheels_per_side, several)
     return [f"{axle}{side}" for axle in axles for side in ("left", "right")]
-
-
-def _list_pose(one: PoseTopic, child: str) -> list[Published]:
-    if one.form == "tf":
-        return [
-            transform(one.topic, "tracking", "odom", "base_link"),
-            transform(one.topic, "relocalization", "map", "odom"),
-        ]
-    if one.form == "pose_stamped":
-        fields: Fields = {**pose_fields("pose.position", "pose.orientation"), "header.frame_id": "map"}
-        return [Published(one.topic, "geometry_msgs/msg/PoseStamped", "localization", fields)]
-    if one.form == "pose_covariance":
-        return [pose_with_covariance(one.topic, 1)]
-    return [odometry(one.topic, "localization", "map", child)]
-
-
-def _mount(child: str, position: Floats, yaw: float) -> Published:
-    """Where a sensor is on the vehicle."""
-    made = transform("/tf_static", "once", "base_link", child)
-    series = name_pose(position[None], rigid.quaternions_from_yaw(np.array([yaw])))
-    known = {path: float(series[one.name][0]) for path, one in made.fields.items() if isinstance(one, Q)}
-    return replace(made, fields={**made.fields, **known})

@@ -85,14 +85,6 @@ def test_steady_circle_has_the_velocity_of_the_formula() -> None:
         np.testing.assert_allclose(steady_velocity(effects), expected, atol=1e-6, err_msg=str(effects))
 
 
-def test_ground_effects_may_act_on_what_inertia_made() -> None:
-    after = steady_velocity(
-        {"body_inertia": 0.5, "lateral_skid": 0.1}, replace(CIRCLE, ground_input="inertia")
-    )
-    v_x = V0 / INERTIA
-    np.testing.assert_allclose(after, (v_x, -0.5 * W0 * v_x - 0.1 * v_x * W0, W0), atol=1e-6)
-
-
 # On mecanum wheels a circle is driven at 60 % of 0.8 m/s ahead and to the left, and of 1.2 rad/s.
 AHEAD, ASIDE, AROUND = 0.48, 0.48, 0.72
 LEVER, RADIUS = 0.5 * (0.3 + 0.47), 0.0475

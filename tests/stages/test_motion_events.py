@@ -6,19 +6,12 @@ import numpy as np
 import polars as pl
 import pytest
 from few import few
+from incidents import TRACTION, Incident, IncidentKind, simulate_incidents
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.run.signals import Limits, trace_traction
-from pipeline.simulate import (
-    TRACTION,
-    VEHICLES,
-    Incident,
-    IncidentKind,
-    Scenario,
-    simulate_run,
-    write_log,
-)
+from pipeline.simulate import VEHICLES, Scenario, write_log
 from pipeline.simulate.scenario import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.inputs import Ideal
@@ -124,9 +117,9 @@ def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Pat
     at = np.arange(0.0, 89.0, 0.1)
     ahead = Commands(at, np.where(at % 30.0 < 27.0, 0.6, 0.0), 0.3 * (at % 30.0 < 8.0))
     incidents = tuple(Incident(kind, *one) for one in times)
-    scenario = Scenario(VEHICLES["husky"], played=ahead, duration_s=90.0, seed=4, incidents=incidents)
+    scenario = Scenario(VEHICLES["husky"], played=ahead, duration_s=90.0, seed=4)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_log(simulate_run(scenario), path)
+    write_log(simulate_incidents(scenario, *incidents), path)
     return path
 
 

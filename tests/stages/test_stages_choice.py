@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from clocks import SimulatedClock
 from simulated_platforms import scene_of
 from stage_logs import FIELD, PLAIN, TakeThrough
 
@@ -13,7 +14,7 @@ from pipeline.core import rigid
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
 from pipeline.recording.log_choice import Choice, choose
-from pipeline.simulate import Clock, PoseSensor, Recording, Scenario, make_scenario, simulate_run, write_log
+from pipeline.simulate import PoseSensor, Recording, Scenario, make_scenario, simulate_run, write_log
 from pipeline.sources import (
     Configuration,
     DriveSection,
@@ -210,7 +211,7 @@ def test_simulated_time_carries_topics_without_stamps_along(factor: float) -> No
 
 def test_a_simulated_log_keeps_its_effects(tmp_path: Path) -> None:
     scenario = scene_of("nav2", {}, seed=3, duration_s=40.0)
-    chosen = look(record(replace(scenario, clock=Clock(real_time_factor=0.3)), tmp_path))
+    chosen = look(record(replace(scenario, clock=SimulatedClock(factor=0.3)), tmp_path))
     assert str(chosen.sources.pose) == "/tf"
     assert chosen.ratings[0].coverage == pytest.approx(1.0, abs=0.05)
 

@@ -1,7 +1,6 @@
 """Twist of a car whose angular.z is a steering angle, as some drivers of Ackermann vehicles take it."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +16,19 @@ from pipeline.simulate import (
     LAYOUTS,
     VEHICLES,
     Disturbance,
+    Layout,
     Program,
     Recording,
     Scenario,
     simulate_run,
     write_log,
 )
-from pipeline.simulate.facts import DriveTopic
 from pipeline.simulate.scenario import Commands
+from pipeline.simulate.topics import twist
 from pipeline.sources import find_preset
 from pipeline.store import Manifest
 
-_LAYOUT = replace(LAYOUTS["ackermann"], commands=(DriveTopic("twist_stamped", ("/cmd_vel",)),), wheels=())
+_LAYOUT = Layout("ackermann", (twist("/cmd_vel", stamped=True), *LAYOUTS["ackermann"].topics[2:]))
 _TOLD = "holds steering angles in place of yaw rates"
 
 
