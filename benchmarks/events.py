@@ -29,7 +29,7 @@ from pipeline.simulate import (
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 
-from incidents import Incident, IncidentKind, simulate_incidents  # noqa: E402 - found by the line above
+from incidents import Incident, IncidentKind, simulate_incidents
 
 KINDS: tuple[IncidentKind, ...] = (
     "digging_in", "stuck", "spinning", "sliding", "emergency_stop", "manual_driving",

@@ -119,7 +119,7 @@ def _refuse_formulas(scenario: Scenario, effects: Effects) -> None:
         what = "only skid-steer vehicles are built of rigid bodies"
         hint = "Choose a differential vehicle"
         raise SimulateError("wrong_vehicle", what, where=scenario.vehicle.name, hint=hint)
-    wrong = [name for name in effects.as_mapping() if name not in _ALLOWED]
+    wrong = [name for name in effects.asked if name not in _ALLOWED]
     if scenario.extra is not None:
         wrong.append("extra")
     if scenario.ground.hill_m > 0.0:

@@ -219,35 +219,36 @@ CATALOGUE: dict[str, EffectSpec] = {
 
 
 class Effects:
-    """The effects of one scenario with their values: complete, checked, and neutral where not asked for."""
+    """The effects of one scenario with their values, neutral where not asked for.
+
+    Attributes:
+        asked: what was asked for, by effect and parameter.
+        written: effects among them that are not in the catalogue.
+    """
 
     def __init__(
-        self, values: Mapping[str, Mapping[str, float]], written: tuple[EffectSpec, ...] = ()
+        self, asked: Mapping[str, Mapping[str, float]], written: tuple[EffectSpec, ...] = ()
     ) -> None:
-        self._values = {name: dict(numbers) for name, numbers in values.items()}
-        self.written = written
+        self.asked, self.written = asked, written
+        numbers = {
+            (spec.id, one): asked.get(spec.id, {}).get(one.name, one.neutral)
+            for spec in (*CATALOGUE.values(), *written)
+            for one in spec.parameters
+        }
+        self._numbers = {(effect, one.name): number for (effect, one), number in numbers.items()}
+        self._active = {
+            effect
+            for (effect, one), number in numbers.items()
+            if number != one.neutral and not math.isnan(one.neutral)
+        }
 
     def value(self, effect: str, parameter: str) -> float:
         """The value of a parameter; its neutral one when the effect was not asked for."""
-        given = self._values.get(effect, {})
-        if parameter in given:
-            return given[parameter]
-        known = CATALOGUE | {spec.id: spec for spec in self.written}
-        if effect not in known:
-            what = f"{effect} is not in pipeline/simulate/effects.toml"
-            raise KeyError(what)
-        return next(item.neutral for item in known[effect].parameters if item.name == parameter)
+        return self._numbers[effect, parameter]
 
     def is_active(self, effect: str) -> bool:
         """Whether any parameter of the effect differs from its neutral value."""
-        return any(
-            not math.isnan(item.neutral) and self.value(effect, item.name) != item.neutral
-            for item in CATALOGUE[effect].parameters
-        )
-
-    def as_mapping(self) -> dict[str, dict[str, float]]:
-        """The values that were asked for, by effect and parameter."""
-        return {name: dict(numbers) for name, numbers in self._values.items()}
+        return effect in self._active
 
 
 def resolve_effects(

@@ -35,7 +35,7 @@ SidePull = declare(
     confused_with=("lateral_drift",),
 )
 '''
-TESTS = ("effects", "effect_facts", "export")
+TESTS = ("effects", "export")
 PLUGIN = """
 import pipeline.models.effects
 pipeline.models.effects.__path__.append({folder!r})
