@@ -138,12 +138,6 @@ class Vehicle:
     controller_track_multiplier: float = 1.0
     max_sideways_mps: float = 0.0
 
-    def __post_init__(self) -> None:
-        for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
-            if not getattr(self, name) > 0.0:
-                hint = f"Give {name} in SI units"
-                raise SimulateError("bad_vehicle", f"{name} must be above zero", where=self.name, hint=hint)
-
     @property
     def moves_sideways(self) -> bool:
         """Whether it can be asked to."""

@@ -128,8 +128,6 @@ def test_a_steady_circle_has_the_velocity_of_the_formula() -> None:
 
 def test_every_mecanum_wheel_has_an_encoder_of_its_own() -> None:
     wheels = simulate_run(replace(CIRCLE, vehicle=YOUBOT)).wheels
-    assert wheels is not None
-    assert wheels.corners is not None
     steady = (wheels.time_s > 20.0) & (wheels.time_s < 28.0)
     found = [float(wheel[steady].mean()) for wheel in wheels.corners.values()]
     turn = LEVER * AROUND

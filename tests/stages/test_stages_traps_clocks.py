@@ -258,7 +258,6 @@ def test_trap_6_the_sign_of_the_gyro_is_checked_and_corrected(drive: TakeThrough
 def test_trap_6_scale_and_bias_of_the_gyro_are_found_and_taken_off(drive: TakeThrough) -> None:
     taken = drive(replace(FIELD, imu=Imu(scale=0.8, bias_radps=0.05)))
     assert taken.finding("imu_scale").value == pytest.approx(1.25, rel=0.01)
-    assert taken.aligned.alignment.gyro is not None
     # Poses = scale x gyro + bias: an offset of 0.05 in the gyro is one of -0.0625 in the poses.
     assert taken.aligned.alignment.gyro.bias == pytest.approx(-0.0625, abs=2e-3)
     assert rms(taken.velocities["v_w_imu"] - taken.velocities["v_w"]) < 0.03
@@ -271,7 +270,6 @@ def test_trap_6_the_gyro_fits_alike_whenever_the_recorder_was_started(drive: Tak
     for late in (0.0, 12.8, 0.7):
         shifted = {name: frame.with_columns(pl.col("t") + late) for name, frame in tables.items()}
         made = align_tables(shifted, taken.aligned.vehicle, Alignment(), body_commanded=True, where="shifted")
-        assert made.alignment.gyro is not None
         fits.append((made.alignment.gyro.signed_scale, made.alignment.gyro.bias))
     assert fits[1:] == [pytest.approx(fits[0], rel=1e-9)] * 2
 
@@ -324,8 +322,6 @@ def test_a_delay_comes_back_with_its_sign(late: float, seed: int) -> None:
         return np.sum(np.sin(speeds[:, None] * at + phases[:, None]), axis=0)
 
     found = estimate_delay(times, signal(times - late), times, signal(times))
-    assert found is not None
     assert found.seconds == pytest.approx(late, abs=0.01)
     mirrored = estimate_delay(times, -signal(times - late), times, signal(times))
-    assert mirrored is not None
     assert mirrored.correlation < -0.95

@@ -102,7 +102,6 @@ def test_yaw_rates_beyond_the_largest_steering_are_no_angles(
 ) -> None:
     """A turn at full lock is proportional to the speed, too, where the stick asks for a tighter one."""
     car, draw = find_preset("ackermann_car"), np.random.default_rng(5)
-    assert car is not None
     times = np.arange(0.0, 240.0, STEP)
     speed = np.repeat(draw.uniform(0.5, 5.0, 60), 400)
     asked = np.repeat(draw.uniform(-0.8, 0.8, 60), 400) * (0.4 if holds_angles else 1.0)
