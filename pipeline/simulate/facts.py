@@ -171,12 +171,10 @@ def find_vehicle(name: str) -> Vehicle:
 # The formulas themselves stand where they act: ``drivetrain`` (command to wheels), ``body`` (wheels to body
 # velocity) and ``localization`` (what the pose reports). Signs follow REP-103: x forward, y left, z up.
 
-_INF = math.inf
-
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """One number of an effect: its unit, the value that changes nothing, and a usual one.
+    """One number of an effect: its unit, the value that changes nothing, a usual one, and the least possible.
 
     ``neutral`` is NaN for a parameter that only says where an effect acts and so cannot be neutral.
     """
@@ -185,6 +183,7 @@ class ParameterSpec:
     unit: str
     neutral: float
     typical: float
+    least: float = -math.inf
 
 
 @dataclass(frozen=True)
@@ -273,45 +272,24 @@ def resolve_effects(
 
 
 def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> dict[str, float]:
-    names = [item.name for item in spec.parameters]
+    known = {item.name: item for item in spec.parameters}
     if not isinstance(given, Mapping):
-        if len(names) > 1:
+        if len(known) > 1:
             what = "one number is not enough for an effect with several parameters"
-            raise _refuse("parameter_needed", what, spec.id, f"Name them: {', '.join(names)}")
-        given = {names[0]: given}
+            raise _refuse("parameter_needed", what, spec.id, f"Name them: {', '.join(known)}")
+        given = dict.fromkeys(known, given)
     for name, value in given.items():
-        if name not in names:
-            known = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
+        if name not in known:
+            units = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
             what = f"{spec.id} has no parameter '{name}'"
-            raise _refuse("unknown_parameter", what, spec.id, f"Its parameters are {known}")
-        _check_value(spec.id, name, float(value))
+            raise _refuse("unknown_parameter", what, spec.id, f"Its parameters are {units}")
+        least = known[name].least
+        # Only what is without limit where it changes nothing may be infinite.
+        is_endless = math.isinf(value) and not math.isinf(known[name].neutral)
+        if math.isnan(value) or value < least or is_endless:
+            hint = f"Give a finite number{'' if least == -math.inf else f' of at least {least:g}'}"
+            raise _refuse("bad_value", f"{spec.id}.{name} = {float(value)} is not possible", spec.id, hint)
     return {name: float(value) for name, value in given.items()}
-
-
-_NEVER_NEGATIVE = {
-    *("limit", "threshold", "bound", "reset", "scrub", "drag", "creep"),
-    *("friction", "gyration"),
-}
-_UNBOUNDED = {"limit", "bound", "no_load", "friction"}
-_LEAST = {"no_load": 0.1}
-_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "contact_friction": 1.0}
-
-
-def _check_value(effect: str, name: str, value: float) -> None:
-    low = _LEAST.get(name, -_INF)
-    waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
-    if (
-        name in _NEVER_NEGATIVE
-        or name.startswith("tau")
-        or effect in {"steering_play", "steering_sensor_play"}
-        or waits
-    ):
-        low = 0.0
-    elif name == "k" and effect in _SCALES:
-        low = _SCALES[effect]
-    if math.isnan(value) or value < low or (math.isinf(value) and name not in _UNBOUNDED):
-        hint = f"Give a finite number{'' if low == -_INF else f' of at least {low:g}'}"
-        raise _refuse("bad_value", f"{effect}.{name} = {value} is not possible", effect, hint)
 
 
 def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
