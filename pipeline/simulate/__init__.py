@@ -51,7 +51,6 @@ from pipeline.simulate.scenario import (
 )
 from pipeline.simulate.topics import list_topics, publish
 
-_BOOTED_NS = 100_000_000_000
 _MARK = ("simulation", {"by": "slip simulate"})
 """Metadata record of every simulated log: it is never pooled with recordings."""
 
@@ -76,14 +75,11 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
     with LogWriter(path) as writer:
         for table in map(scenario.recording.lose, tables) if scenario.recording.lose else tables:
             header = None if table.header_s is None else scenario.clock.stamp_headers(table.header_s)
-            fields = dict(table.fields)
-            if header is not None and table.stamp != "header":
-                fields, header = fields | _write_stamp(table.stamp, header, scenario.clock.start_ns), None
             writer.write_columns(
                 table.topic,
                 table.type_name,
                 scenario.clock.stamp_log(table.log_s),
-                fields,
+                table.fields,
                 header_time=header,
             )
         if marked:
@@ -92,14 +88,6 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
             writer.metadata(
                 "deployment", {"vehicle": scenario.vehicle.name, "terrain": scenario.recording.terrain}
             )
-
-
-def _write_stamp(field: str, stamps: Ints, start_ns: int) -> dict[str, Field]:
-    """Fields of a stamp [ns] outside a header; a counter of microseconds began some time before the run."""
-    if field.startswith("timestamp"):
-        return {field: ((stamps - start_ns + _BOOTED_NS) // 1000).astype(np.float64)}
-    seconds, rest = np.divmod(stamps, 1_000_000_000)
-    return {f"{field}.sec": seconds.astype(np.float64), f"{field}.nanosec": rest.astype(np.float64)}
 
 
 Made = TypeVar("Made")

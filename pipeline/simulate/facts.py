@@ -46,7 +46,7 @@ class Published:
         source: whose times and quantities it has, an entry of `SOURCES`.
         fields: by field path a quantity, several for an array, what is made of some, or a constant.
         every: one message in so many is published.
-        stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
+        stamp: ``header``, or ``none``.
     """
 
     topic: str

@@ -325,7 +325,6 @@ class Messages:
         log_s: when the recorder got them, shape (n,).
         header_s: what their headers say, shape (n,), or None for a type without header.
         fields: values by field path; an array has one row a message.
-        stamp: where the stamp stands: ``header``, or a field, microseconds if it begins with ``timestamp``.
     """
 
     topic: str
@@ -333,7 +332,6 @@ class Messages:
     log_s: Floats
     header_s: Floats | None
     fields: Mapping[str, Field]
-    stamp: str = "header"
 
 
 @dataclass(frozen=True)

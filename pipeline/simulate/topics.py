@@ -53,10 +53,10 @@ def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Messages]:
             known[one.source] = SOURCES[one.source](run)
         stamp, log, series = known[one.source]
         rows = slice(None, None, one.every)
-        taken = {name: values[rows] for name, values in series.items()}
+        taken = {"stamp": stamp[rows]} | {name: values[rows] for name, values in series.items()}
         fields = {path: _fill(value, taken) for path, value in one.fields.items()}
         header = None if one.stamp == "none" else stamp[rows]
-        tables.append(Messages(one.topic, one.type_name, log[rows], header, fields, one.stamp))
+        tables.append(Messages(one.topic, one.type_name, log[rows], header, fields))
     return tables
 
 
