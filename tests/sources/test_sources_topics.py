@@ -35,9 +35,7 @@ POSES = {"localization", "tracking"}
 
 
 def preset(name: str) -> Vehicle:
-    found = find_preset(name)
-    assert found is not None
-    return found
+    return find_preset(name)
 
 
 def choose(

@@ -15,7 +15,6 @@ STEP_S = 0.05
 def find(command: Floats, is_stopped: Flags, times: Floats | None = None) -> list[tuple[str, float, float]]:
     """Incidents of a vehicle that follows its commands, but for some time."""
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     times = np.arange(command.size) * STEP_S if times is None else times
     follows = np.where(is_stopped, 0.0, command)
     flags = np.zeros(command.size, dtype=bool)

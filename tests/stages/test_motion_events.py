@@ -86,7 +86,6 @@ def test_a_body_that_slides_sideways_does_not_dig_in(
     forward: float, sideways: float, said: list[str]
 ) -> None:
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     times = np.arange(0.0, 60.0, STEP_S)
     # Over two seconds the motion turns from ahead to the side, or is lost.
     part = np.clip((times - 40.0) / 2.0, 0.0, 1.0) * (times < 46.0)
@@ -103,7 +102,6 @@ def test_a_body_that_slides_sideways_does_not_dig_in(
 
 def test_a_sensor_ahead_of_the_axles_is_not_seen_to_slide_in_turns() -> None:
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     times = np.arange(0.0, 60.0, STEP_S)
     turns = np.where((times > 30.0) & (times < 40.0), 1.0, 0.0)
     columns = {"t": times, "v_x": 1.0 - turns, "v_y": turns, "v_w": turns, "x": times, "y": times}

@@ -275,7 +275,6 @@ def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
 )
 def test_velocities_in_another_unit_than_their_positions_are_converted(unit: str | None, gain: float) -> None:
     husky = find_preset("husky_a200")
-    assert husky is not None
     count = 400
     times = np.arange(count) / 20.0
     speed = 3.0 + np.sin(times)
