@@ -22,8 +22,8 @@ from pipeline.core import (
 )
 from pipeline.simulate.drivetrain import apply_ideal_model
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle, resolve_effects
-from pipeline.simulate.messages import SimulatedRun, Truth, ask_wheels, record_truth
 from pipeline.simulate.path import Path
+from pipeline.simulate.run import SimulatedRun, Truth, ask_wheels, record_truth
 from pipeline.simulate.scenario import BodyMotion, Drive, Scenario
 
 _STEP_S = 0.002

@@ -31,9 +31,10 @@ from pipeline.simulate.facts import (
     resolve_effects,
     unknown_name,
 )
-from pipeline.simulate.messages import SimulatedRun, simulate_run
+from pipeline.simulate.messages import list_topics, publish
 from pipeline.simulate.path import SLOPE_EFFECTS
 from pipeline.simulate.programs import read_played
+from pipeline.simulate.run import SimulatedRun, simulate_run
 from pipeline.simulate.scenario import (
     Clock,
     Disturbance,
@@ -49,7 +50,6 @@ from pipeline.simulate.scenario import (
     Scenario,
     State,
 )
-from pipeline.simulate.topics import list_topics, publish
 
 _MARK = ("simulation", {"by": "slip simulate"})
 """Metadata record of every simulated log: it is never pooled with recordings."""

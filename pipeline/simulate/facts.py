@@ -307,7 +307,7 @@ class Layout:
 
     Attributes:
         kind: vehicles that have it.
-        topics: topics, or rows of them as `topics.read_topic` takes them.
+        topics: topics, or rows of them as `messages.read_topic` takes them.
     """
 
     kind: Kind

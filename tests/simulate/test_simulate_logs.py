@@ -24,7 +24,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.simulate.topics import list_topics
+from pipeline.simulate.messages import list_topics
 
 SHORT = Scenario(duration_s=12.0)
 START_NS = SHORT.clock.start_ns

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.rigid import rotate
 from pipeline.simulate.facts import CATALOGUE, VEHICLES, Vehicle
-from pipeline.simulate.messages import simulate_run
+from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Commands, Disturbance, Ground, Program, Scenario, State
 
 Floats = NDArray[np.float64]

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.logs import ChannelInfo
 from pipeline.simulate import LAYOUTS, VEHICLES, Scenario
-from pipeline.simulate.topics import list_topics
+from pipeline.simulate.messages import list_topics
 from pipeline.sources import (
     Configuration,
     ConfigurationError,

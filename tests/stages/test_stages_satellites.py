@@ -12,7 +12,7 @@ from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 from pipeline.logs import TopicColumns
 from pipeline.simulate import Imu, Layout, PoseSensor, Scenario
 from pipeline.simulate.facts import Published
-from pipeline.simulate.topics import imu, joints, twist
+from pipeline.simulate.messages import imu, joints, twist
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver
 from pipeline.stages.satellite import (

@@ -23,8 +23,8 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
+from pipeline.simulate.messages import twist
 from pipeline.simulate.scenario import Commands
-from pipeline.simulate.topics import twist
 from pipeline.sources import find_preset
 from pipeline.store import Manifest
 
