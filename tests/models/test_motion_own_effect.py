@@ -69,7 +69,6 @@ def test_a_model_file_never_names_code(place: Path) -> None:
 def test_the_workbench_offers_an_effect_that_was_loaded(place: Path) -> None:
     assert run_verb("model", "new-effect", "side_wind.py").returncode == 0
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     assert "side_wind" not in {one["id"] for one in list_catalogue(vehicle)}
     load_effects([place / "side_wind.py"])
     assert "side_wind" in {one["id"] for one in list_catalogue(vehicle)}

@@ -35,7 +35,7 @@ SidePull = declare(
     confused_with=("lateral_drift",),
 )
 '''
-TESTS = ("effects", "effect_facts", "export")
+TESTS = ("effects", "export")
 PLUGIN = """
 import pipeline.models.effects
 pipeline.models.effects.__path__.append({folder!r})
@@ -68,7 +68,6 @@ def test_a_file_of_an_effect_is_all_that_it_needs(tmp_path: Path) -> None:
     assert "    v_y += k * v0 * abs(v0)\n" in handbook["effects/side_pull.md"]
     assert "[side_pull](side_pull.md)" in handbook["effects/index.md"]
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     effect = find_effect("side_pull")(k=0.2)
     assert effect.describe_motion(vehicle) == "Side pull: k = 0.2 s/m"
     rows = run_exported(
