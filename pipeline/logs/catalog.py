@@ -9,10 +9,9 @@ from typing import Any, Final
 from mcap.records import Channel, Schema
 
 from pipeline.core import format_size, name_first
-from pipeline.logs.chunks import largest_plausible
+from pipeline.logs.chunks import Span, SpanKind, largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
-from pipeline.logs.spans import Span, SpanKind
 
 _MAX_EXTRAS: Final = 64 << 20
 """Maximum size of a file's metadata and names of attachments [bytes]; the largest recorded is a robot
@@ -61,11 +60,10 @@ class Catalog:
     """Contents of a file.
 
     ``container`` is the kind of file, empty for MCAP. ``most_inflated`` is the user's limit of the inflated
-    size of a bag [bytes], counted while it is read, ``bag_chunks`` is the number of its chunks: it has no
-    spans. ``metadata`` and ``attachments`` are in the order of the file, ``side_records`` are their offsets,
-    lengths and names. ``counts`` are messages by channel number. ``covers`` is the evidence for each schema
-    and channel of an MCAP file, ``contradicted`` are those with differing copies, and ``rivals`` are the
-    copies in the summary that lost to copies in the data section.
+    size [bytes]; that of a database, which has no spans, is counted while it is read. ``metadata`` and
+    ``attachments`` are in the order of the file, ``side_records`` are their offsets, lengths and names.
+    ``counts`` are messages by channel number. ``bare`` are the schemas and channels that no checksum covers,
+    ``contradicted`` those with differing copies, ``repeated`` the copies after the data section.
     """
 
     container: str = ""
@@ -78,7 +76,6 @@ class Catalog:
     contradicted: set[tuple[type, int]] = field(default_factory=set)
     repeated: list[Schema | Channel] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
-    bag_chunks: int = 0
     compressions: set[str] = field(default_factory=set)
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     attachments: list[str] = field(default_factory=list)
@@ -94,7 +91,12 @@ class Catalog:
 
     def count_chunks(self) -> int:
         """Number of chunks; 0 of a file that has none."""
-        return self.bag_chunks + sum(span.kind.value != "loose" for span in self.spans)
+        return sum(span.kind.value != "loose" for span in self.spans)
+
+    def add_times(self, first: int, last: int) -> None:
+        """Add the first and last log time [ns] of some messages."""
+        self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
+        self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
 
     def add_description(self, record: Schema | Channel, *, covered: bool) -> None:
         """Add a schema or channel: the first of a number counts, or the first that a checksum covers."""

@@ -1,10 +1,10 @@
 """Chunks of an MCAP file or a bag: inflating them within size limits, and locating the messages in them."""
 
 import bz2
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
+from enum import Enum
 from typing import IO, Final
 
 import numpy as np
@@ -12,14 +12,14 @@ import zstandard
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, format_size
+from pipeline.core import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30
 """Maximum inflated size of a chunk [bytes]; recorders write 1 to 100 MB."""
 
-_COMPRESSIONS: Final = ("", "zstd", "lz4")
+_COMPRESSIONS: Final = ("", "zstd", "lz4", "bz2")
 _PLAUSIBLE: Final = 256 << 20
 _PLAUSIBLE_RATIO: Final = 1000
 """Maximum inflation ratio of a chunk larger than `_PLAUSIBLE` bytes; only malicious files exceed it."""
@@ -48,7 +48,7 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
 
     Args:
         stored: compressed bytes.
-        compression: ``""``, ``"zstd"`` or ``"lz4"``.
+        compression: ``""``, ``"zstd"``, ``"lz4"``, or ``"bz2"`` of bags.
         size: expected inflated size [bytes].
 
     Raises:
@@ -61,6 +61,8 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
         inflated = b""
     elif compression == "zstd":
         inflated = _inflate_zstd(stored, size)
+    elif compression == "bz2":
+        inflated = _inflate_bz2(stored, size)
     else:
         inflated = _inflate_lz4(stored, size)
     if len(inflated) != size:
@@ -128,6 +130,15 @@ def _inflate_zstd(stored: Buffer, size: int) -> bytes:
         return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
 
 
+def _inflate_bz2(stored: Buffer, size: int) -> bytes:
+    with _naming_damage():
+        decompressor = bz2.BZ2Decompressor()
+        inflated = decompressor.decompress(stored, max_length=size + 1)
+        if not decompressor.eof and len(inflated) == size:
+            inflated += decompressor.decompress(b"", max_length=1)
+        return inflated
+
+
 def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
 
@@ -172,6 +183,40 @@ MESSAGE_OVERHEAD: Final = MESSAGE_HEAD.itemsize
 """Size of a message record before its payload [bytes]."""
 
 
+class SpanKind(Enum):
+    """Kind of a span."""
+
+    CHUNK = "chunk"
+    LOOSE = "loose"
+    CUT_CHUNK = "cut chunk"
+    BAG_CHUNK = "chunk of a bag"
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A range of the file that contains messages: a chunk, or message records outside chunks.
+
+    Attributes:
+        kind: kind of the span.
+        offset: offset of its first byte in the file.
+        length: size without its message indexes [bytes]; with them of a bag.
+        index_length: size of the message indexes after it [bytes].
+        start_ns: first log time as stated by the summary or the chunk, None if unknown.
+        end_ns: last log time, None if unknown.
+        channels: numbers of the channels in it, None if unknown.
+        inflated: inflated size of a chunk as stated by the summary or its header [bytes].
+    """
+
+    kind: SpanKind
+    offset: int
+    length: int
+    index_length: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    channels: frozenset[int] | None = None
+    inflated: int = 0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
     """The messages of a chunk, in the order of their offsets.
@@ -179,7 +224,7 @@ class Messages:
     Attributes:
         start: offset of each payload in the chunk, int64, shape (n,).
         size: size of each payload [bytes], int64.
-        channel: channel number, uint16.
+        channel: channel number, uint16 (int64 of a bag).
         sequence: sequence number assigned by the writer, uint32.
         log_time: [ns], int64.
         publish_time: [ns], int64.
@@ -190,7 +235,7 @@ class Messages:
 
     start: Ints
     size: Ints
-    channel: NDArray[np.uint16]
+    channel: NDArray[np.integer]
     sequence: NDArray[np.uint32]
     log_time: Ints
     publish_time: Ints
@@ -315,51 +360,3 @@ def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
     located.descriptions.append(record)
     located.known.add(content)
     return True
-
-
-@cache
-def list_decompressors() -> dict[str, Callable[[], bz2.BZ2Decompressor]]:
-    """Factories of decompressors by the name of the compression."""
-    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
-
-    return {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-
-
-class BudgetError(Exception):
-    """The inflated size exceeds the limit of the file."""
-
-
-@dataclass(slots=True)
-class Allowance:
-    """Remaining bytes that a bag may yield, out of ``most``: those of its chunks, or of its messages."""
-
-    most: int
-    remaining: int
-
-    def take(self, size: int) -> None:
-        """Charge bytes that were produced.
-
-        Raises:
-            BudgetError: they exceed the limit.
-        """
-        self.remaining -= size
-        if self.remaining < 0:
-            raise BudgetError(
-                f"its content is more than {format_size(self.most)}, and no more is read; "
-                "a larger --max-inflated reads more"
-            )
-
-    def inflate_chunk(self, name: str, stored: bytes) -> bytes:
-        """Inflate a chunk with the given compression, up to a plausible size.
-
-        Raises:
-            InflateError: it is cut, or larger.
-            BudgetError: it exceeds the limit.
-        """
-        decompressor = list_decompressors()[name]()
-        most = min(largest_plausible(len(stored)), self.remaining + 1)
-        inflated: bytes = decompressor.decompress(stored, max_length=most)
-        self.take(len(inflated))
-        if not decompressor.eof:
-            raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
-        return inflated

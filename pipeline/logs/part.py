@@ -23,6 +23,7 @@ from pipeline.core import guess_names
 from pipeline.logs import records as rec
 from pipeline.logs.bags import catalog_bag
 from pipeline.logs.catalog import Catalog, keep_within
+from pipeline.logs.chunks import Span, SpanKind
 from pipeline.logs.compressed import COMPRESSED, open_inflated
 from pipeline.logs.records import (
     LONGEST_HEAD,
@@ -35,7 +36,7 @@ from pipeline.logs.records import (
 )
 from pipeline.logs.remote import RemotePath, RemoteSource
 from pipeline.logs.scan import Numbered, Scanner, find_missing
-from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
+from pipeline.logs.spans import Loaded, load_spans
 
 _HASH_BLOCK: Final = 1 << 20
 _MOST_NEIGHBOURS: Final = 1000
@@ -194,7 +195,10 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
     head = source.read_at(0, LONGEST_MAGIC)
     is_mcap = head.startswith(rec.MAGIC)
     if not is_mcap and (container := detect_container(head)):
-        return catalog_bag(source, container, max_inflated)
+        catalog = catalog_bag(source, container)
+        catalog.most_inflated = max_inflated
+        keep_within(catalog, source.size, max_inflated)
+        return catalog
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
@@ -430,8 +434,7 @@ def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
             catalog.counts[number] = catalog.counts.get(number, 0) + count
         if messages.log_time.size:
             first, last = int(messages.log_time.min()), int(messages.log_time.max())
-            catalog.start_ns = first if catalog.start_ns is None else min(first, catalog.start_ns)
-            catalog.end_ns = last if catalog.end_ns is None else max(last, catalog.end_ns)
+            catalog.add_times(first, last)
             if span.start_ns is None:
                 span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
         examined.append(replace(span, channels=frozenset(numbers.tolist())))

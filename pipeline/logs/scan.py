@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pipeline.core import Ints, group_rows, name_first
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
-from pipeline.logs.chunks import FIRST_PRIVATE
+from pipeline.logs.chunks import FIRST_PRIVATE, Span, SpanKind
 from pipeline.logs.records import ByteSource, Loss
-from pipeline.logs.spans import Span, SpanKind
 
 _FIRST_WINDOW: Final = 1 << 12
 _WINDOW: Final = 1 << 18
@@ -250,7 +249,7 @@ def _possible_places(data: NDArray[np.uint8], high: int, end: int) -> Ints:
 _STEPS_PER_JUMP: Final = 20
 """Minimum number of increments by one per jump; below it, sequence numbers do not count messages."""
 
-Numbered: TypeAlias = tuple[Span, NDArray[np.uint16], NDArray[np.uint32], Ints]
+Numbered: TypeAlias = tuple[Span, NDArray[np.integer], NDArray[np.uint32], Ints]
 """A whole chunk with channels, sequence numbers and log times [ns] of its messages."""
 
 
