@@ -216,6 +216,11 @@ class Span:
     channels: frozenset[int] | None = None
     inflated: int = 0
 
+    @property
+    def end(self) -> int:
+        """Offset after it and its message indexes."""
+        return self.offset + self.length + self.index_length
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
@@ -331,17 +336,15 @@ def _agreeing_messages(
 
 def _walk(chunk: Buffer, start: int, end: int, located: _WalkedChunk) -> None:
     """Note the records from ``start`` on; what follows the first bytes that are none is damage."""
-    unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
-    position = start
-    while position < end:
-        opcode, length = unpack(chunk, position) if position + head_size <= end else (0, 0)
-        after = position + head_size + length
-        if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
+    after = start
+    for opcode, position, following in rec.split_records(chunk, start, end):
+        if opcode == rec.MESSAGE:
             located.offsets.append(position)
-        elif after > end or not _take_side_record(opcode, chunk[position + head_size : after], located):
-            located.damage.append((position, end))
-            return
-        position = after
+        elif not _take_side_record(opcode, chunk[position + rec.HEAD_SIZE : following], located):
+            break
+        after = following
+    if after < end:
+        located.damage.append((after, end))
 
 
 def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:

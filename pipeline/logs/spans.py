@@ -102,18 +102,15 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer) -> Loaded:
 
 
 def _read_entries(blob: Buffer) -> list[Entries] | None:
+    """Channels and entries of the message indexes after a chunk; None if there are none that can be read."""
     entries: list[Entries] = []
-    position = 0
-    while position + rec.HEAD_SIZE <= len(blob):
-        opcode, length = rec.HEAD.unpack_from(blob, position)
-        position += rec.HEAD_SIZE
-        if opcode != rec.MESSAGE_INDEX or length > len(blob) - position:
+    for opcode, position, end in rec.split_records(blob, 0, len(blob)):
+        if opcode != rec.MESSAGE_INDEX:
             return None
         try:
-            entries.append(rec.parse_message_index(blob[position : position + length]))
+            entries.append(rec.parse_message_index(blob[position + rec.HEAD_SIZE : end]))
         except rec.RecordError:
             return None
-        position += length
     return entries or None
 
 
