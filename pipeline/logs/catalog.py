@@ -172,7 +172,6 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         taken += work if fits else 0
         (within if fits else omitted).append(span)
     catalog.spans = within
-    starts, ends = _list_times(omitted)
     text = (
         f"the chunks of the file decompress to {format_size(total)}, {total / size:.0f} times its size, and "
         f"at most {format_size(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks "
@@ -182,10 +181,9 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         Loss(
             OVER_BUDGET,
             text,
-            bytes=sum(span.length for span in omitted),
-            chunks=len(omitted),
-            start_ns=min(starts, default=None),
-            end_ns=max(ends, default=None),
+            sum(span.length for span in omitted),
+            len(omitted),
+            *_range_of(omitted),
         )
     )
 
@@ -195,10 +193,11 @@ def _work(inflated: int, stored: int) -> int:
     return inflated if inflated <= largest_plausible(stored) else 0
 
 
-def _list_times(spans: Sequence[Span]) -> tuple[list[int], list[int]]:
-    """Known first and last log times of spans [ns]."""
-    starts = [span.start_ns for span in spans if span.start_ns is not None]
-    return starts, [span.end_ns for span in spans if span.end_ns is not None]
+def _range_of(spans: Sequence[Span]) -> tuple[int | None, int | None]:
+    """First and last known log time of spans [ns]."""
+    starts = (span.start_ns for span in spans if span.start_ns is not None)
+    ends = (span.end_ns for span in spans if span.end_ns is not None)
+    return min(starts, default=None), max(ends, default=None)
 
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
@@ -265,13 +264,12 @@ class DataSection:
                 f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
                 "something else is damaged, such as metadata or chunks that were not read"
             )
-        starts, ends = _list_times(self._catalog.spans)
         return Loss(
             "checksum_mismatch",
             text,
-            bytes=self._catalog.data_end or 0,
-            start_ns=min(starts, default=None),
-            end_ns=max(ends, default=None),
+            self._catalog.data_end or 0,
+            0,
+            *_range_of(self._catalog.spans),
         )
 
 

@@ -1,7 +1,7 @@
 """Chunks of an MCAP file or a bag: inflating them within size limits, and locating the messages in them."""
 
 import bz2
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import Enum
@@ -19,7 +19,6 @@ from pipeline.logs.records import Buffer
 MAX_CHUNK: Final = 1 << 30
 """Maximum inflated size of a chunk [bytes]; recorders write 1 to 100 MB."""
 
-_COMPRESSIONS: Final = ("", "zstd", "lz4", "bz2")
 _PLAUSIBLE: Final = 256 << 20
 _PLAUSIBLE_RATIO: Final = 1000
 """Maximum inflation ratio of a chunk larger than `_PLAUSIBLE` bytes; only malicious files exceed it."""
@@ -55,16 +54,10 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
         InflateError: the inflated size differs, the bytes are damaged, or the size is implausible.
     """
     check_size(len(stored), compression, size)
-    if compression == "":
-        inflated: Buffer = stored
-    elif size == 0:
-        inflated = b""
-    elif compression == "zstd":
-        inflated = _inflate_zstd(stored, size)
-    elif compression == "bz2":
-        inflated = _inflate_bz2(stored, size)
-    else:
-        inflated = _inflate_lz4(stored, size)
+    inflated = stored if compression == "" else b""
+    if compression and size:
+        with _naming_damage():
+            inflated = _INFLATERS[compression](stored, size)
     if len(inflated) != size:
         raise InflateError(f"{len(inflated)} bytes came out in place of {size}")
     return inflated
@@ -76,7 +69,7 @@ def check_size(stored: int, compression: str, size: int) -> None:
     Raises:
         InflateError: it is not, or the compression is unknown.
     """
-    if compression not in _COMPRESSIONS:
+    if compression not in ("", *_INFLATERS):
         raise InflateError(f"the compression {compression[:20]!r} is not known")
     if size > largest_plausible(stored):
         raise InflateError(f"{stored} bytes say they hold {size}, as no recording does")
@@ -123,27 +116,32 @@ def holds_own_checksum(stored: Buffer, compression: str) -> bool:
 
 
 def _inflate_zstd(stored: Buffer, size: int) -> bytes:
-    with _naming_damage():
-        said = zstandard.frame_content_size(stored)
-        if said not in (-1, size):
-            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    said = zstandard.frame_content_size(stored)
+    if said not in (-1, size):
+        raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
+    return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
 
 
 def _inflate_bz2(stored: Buffer, size: int) -> bytes:
-    with _naming_damage():
-        decompressor = bz2.BZ2Decompressor()
-        inflated = decompressor.decompress(stored, max_length=size + 1)
-        if not decompressor.eof and len(inflated) == size:
-            inflated += decompressor.decompress(b"", max_length=1)
-        return inflated
+    decompressor = bz2.BZ2Decompressor()
+    # One more byte than there should be tells content that is longer.
+    inflated = decompressor.decompress(stored, max_length=size + 1)
+    if not decompressor.eof and len(inflated) <= size:
+        raise InflateError("its end is missing")
+    return inflated
 
 
 def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
 
-    with _naming_damage():
-        return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
+    return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
+
+
+_INFLATERS: Final[dict[str, Callable[[Buffer, int], Buffer]]] = {
+    "zstd": _inflate_zstd,
+    "lz4": _inflate_lz4,
+    "bz2": _inflate_bz2,
+}
 
 
 def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO[bytes]]:

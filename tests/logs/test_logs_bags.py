@@ -16,7 +16,18 @@ from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionMode
 
-from pipeline.logs import LogError, Wanted, bags, hash_log, is_finished, open_log, read_topics
+from pipeline.logs import (
+    LogError,
+    Wanted,
+    bags,
+    hash_log,
+    is_finished,
+    open_log,
+    open_store,
+    read_topics,
+    ros1,
+    to_location,
+)
 from pipeline.logs import chunks as inflate_module
 
 
@@ -134,6 +145,33 @@ def test_around_damage_in_a_bag_everything_is_read_and_the_lost_told(tmp_path: P
     (loss,) = data.losses
     assert loss.text.startswith("1 message in the chunk at byte ")
     assert loss.start_ns == loss.end_ns == START + int(4 * missing)
+
+
+def test_a_message_that_the_index_of_a_bag_names_many_times_is_read_once(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    values = write_counter(path, 400)
+    content = bytearray(path.read_bytes())
+    with BagReader(path) as reader:
+        place = reader.chunk_infos[0].pos
+    _, _, place = ros1._split(content, place)
+    _, start, end = ros1._split(content, place)
+    count = (end - start) // 12
+    content[start:end] = content[start : start + 12] * count
+    path.write_bytes(content)
+    data = read_topics(path, [Wanted("/x")])
+    assert len(data.of("/x")[0]) == len(values) - count + 1
+    (loss,) = data.losses
+    assert loss.text.startswith(f"{count - 1} messages in the chunk at byte ")
+
+
+def test_a_bag_of_ros_1_is_read_from_an_object_store_and_a_database_is_not(tmp_path: Path) -> None:
+    store = open_store("memory://bags")
+    bag, (file,) = write_bag(tmp_path / "run.bag"), write_db3(tmp_path / "run").glob("*.db3")
+    for name, path in (("run.bag", bag), ("run.db3", file)):
+        store.pipe(f"/bags/{name}", path.read_bytes())
+    assert read_all(to_location("memory://bags/run.bag")) == read_all(bag)
+    with pytest.raises(LogError, match="SQLite file is not read from an object store"):
+        open_log("memory://bags/run.db3")
 
 
 @given(data=st.data())
