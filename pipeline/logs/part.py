@@ -220,8 +220,8 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
         examine_spans(source, catalog, threads)
     if summary is None:
         catalog.notes.append(f"{reason}; the index was rebuilt by reading all records")
-        is_told = any(each.kind == "truncated" for each in catalog.losses)
-        if isinstance(reason, _DamagedSummaryError) and not is_told:
+        has_loss = any(each.kind == "truncated" for each in catalog.losses)
+        if isinstance(reason, _DamagedSummaryError) and not has_loss:
             text = f"{reason}; all records were read instead"
             catalog.losses.append(Loss("damaged_summary", text))
     else:
