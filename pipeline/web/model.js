@@ -1,6 +1,5 @@
 // The model of a session: its effects as cards, and what to add next, one row an effect.
 import { h, say, sayAngle, sayLength, sayShare, setSquares } from "./parts.js";
-import { buildPlan } from "./plan.js";
 
 const REST_MS = 350;
 const FIRST_ROWS = 4;
@@ -58,7 +57,7 @@ const buildReach = (pane, next) => {
     : [h("span", { class: session.done ? "done" : "" }, session.remains)]));
 };
 
-const addRow = (pane, row) => (row.named && row.formula.length ? pane.addFound() : pane.add(row.id));
+const addRow = (pane, row) => pane.add(row.id);
 
 // Cards -----------------------------------------------------------------------------------------------------
 
@@ -163,7 +162,7 @@ const buildNext = (pane) => {
     trial?.done && !next && !(session.done && rows.length > 0) && h("p", { class: session.done ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
-    undecided, rest, buildPlan(pane),
+    undecided, rest,
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
 };
 
