@@ -1,8 +1,8 @@
 """The workbench: a local page to see where a model fails, to add effects, and to see the error decrease.
 
 The server has one session for each side of the page (A and B), in memory; models are saved on request in the
-results folder. The figures are those of the report. Logs that are dropped on the page are analyzed in a process
-with limits of time and memory.
+results folder. The figures are those of the report. Logs that are dropped on the page are analyzed in a
+process with limits of time and memory.
 """
 
 from collections.abc import Iterator
