@@ -64,7 +64,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     slot: Slot = "a"
     input: Literal["command", "measured"] | None = None
     action: Literal[
-        "open", "add", "drop", "switch", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try"
+        "open", "add", "drop", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try"
     ] = "open"
     anyway: bool = False
     effect: Line = ""

@@ -27,9 +27,8 @@ class Step:
 
     Attributes:
         said: short text of the action.
-        model: the model, with the effects that are switched off.
+        model: the model.
         order: ids of its effects in the order in which they were added.
-        off: ids of effects that are switched off.
         intervals: 95 % intervals by label ``effect.parameter``.
         wheel_delay_s: delay of the recorded wheels [s].
         ladder: from the ideal model upwards.
@@ -41,18 +40,12 @@ class Step:
     said: str
     model: Model
     order: tuple[str, ...] = ()
-    off: frozenset[str] = frozenset()
     intervals: Mapping[str, tuple[float, float]]
     wheel_delay_s: float = 0.0
     ladder: tuple[results.Step, ...] = ()
     without: Mapping[str, float]
     by_hand: bool = False
     refused: Mapping[str, str]
-
-    @property
-    def acting(self) -> Model:
-        """The model without the effects that are switched off."""
-        return _leave_out(self.model, self.off)
 
 
 @dataclass(frozen=True)
@@ -98,9 +91,9 @@ class Session:
         return known.get(self.prepared.data.source.value) or self.prepared.floor
 
     def show(self) -> Shown:
-        """The current model on its run, without the effects that are switched off."""
+        """The current model on its run."""
         step = self.step
-        return self.prepared.show(step.acting, step.wheel_delay_s, step.ladder, self.floor)
+        return self.prepared.show(step.model, step.wheel_delay_s, step.ladder, self.floor)
 
     def begin(self, model: Model) -> Model:
         """The model from which a fit begins: effects of the diagnosis have the values that it gives them.
@@ -119,8 +112,8 @@ class Session:
         missing = (one for one in self.diagnosed if one.id not in step.order)
         sound = tuple(one for one in missing if explain_refusal(one, intervals) is None)
         offered = prepared.data.active_effects(Model(prepared.vehicle, sound))
-        before = prepared.score(step.acting, step.wheel_delay_s)
-        model = _leave_out(self.begin(step.model), step.off)
+        before = prepared.score(step.model, step.wheel_delay_s)
+        model = self.begin(step.model)
         ranked = rank_named(prepared.measure_errors, model, before, offered)
         return [show_addition(one, before, model) for one in ranked]
 
@@ -158,15 +151,20 @@ class Session:
         """Fit all values that are not held fixed, starting from the present ones."""
         return self._fit(self.step.model, self.step.order, "fit", afresh=True)
 
-    def switch(self, name: str) -> Session:
-        """Switch an effect off or on without a fit, to show its contribution immediately."""
-        off = self.step.off ^ {self.step.model.effect(name).id}
-        return self._set(self.step.model, f"{name} {'off' if name in off else 'on'}", off)
-
     def set_value(self, name: str, parameter: str, value: float) -> Session:
         """Set a value of an effect by hand, without a fit."""
-        model = self.step.model.change(name, **{parameter: value})
-        return self._set(model, f"{name}: {parameter} = {value:.4g}", self.step.off)
+        step = self.step
+        model = step.model.change(name, **{parameter: value})
+        errors, known = self.prepared.score(model, step.wheel_delay_s), self.prepared.find_fit(model)
+        changed = replace(
+            step,
+            said=f"{name}: {parameter} = {value:.4g}",
+            model=model,
+            ladder=(*step.ladder[:-1], self._measure(step.ladder[-1].effects, errors)),
+            intervals={} if known is None else known.estimates.shared_intervals,
+            by_hand=known is None,
+        )
+        return self._push(changed)
 
     def lock(self, name: str, parameter: str) -> Session:
         """Hold a value fixed in fits, or release it."""
@@ -182,7 +180,7 @@ class Session:
 
     def format_file(self) -> ModelFile:
         """The model as it is saved: with the data of its fit, unless values were set by hand since."""
-        file = ModelFile(self.step.acting, intervals=self.step.intervals)
+        file = ModelFile(self.step.model, intervals=self.step.intervals)
         is_fitted = file.model.effects and not self.step.by_hand
         return self.prepared.note_fit(file) if is_fitted else file
 
@@ -190,40 +188,17 @@ class Session:
         steps = (*self.steps[: self.at + 1], step)[-_MOST_STEPS:]
         return replace(self, steps=steps, at=len(steps) - 1)
 
-    def _set(self, model: Model, said: str, off: frozenset[str]) -> Session:
-        step, acting = self.step, _leave_out(model, off)
-        errors = self.prepared.score(acting, step.wheel_delay_s)
-        known = self.prepared.find_fit(acting)
-        shown = tuple(name for name in step.order if name not in off)
-        ladder = (
-            *(one for one in step.ladder if set(one.effects) < set(shown)),
-            self._measure(shown, errors),
-        )
-        intervals = {} if known is None else known.estimates.shared_intervals
-        return self._push(
-            replace(
-                step,
-                said=said,
-                model=model,
-                off=off,
-                ladder=ladder,
-                intervals=intervals,
-                by_hand=known is None,
-            )
-        )
-
     def _fit(self, model: Model, order: Sequence[str], said: str, *, afresh: bool = False) -> Session:
         """Fit a model; the steps of its ladder are in the order in which effects were added.
 
         Args:
-            model: model including the effects that are switched off.
+            model: the model, with values to start from.
             order: order of its effects.
             said: short text of the action.
             afresh: whether to refit steps that were fitted before.
         """
         step, prepared = self.step, self.prepared
-        off = step.off & set(order)
-        judged = prepared.judge(_leave_out(model, off))
+        judged = prepared.judge(model)
         fitted = judged.step.fitted.model
         shown = tuple(name for name in order if name in fitted)
         # After a change by hand the last step is not fitted.
@@ -239,14 +214,13 @@ class Session:
             said=said,
             model=model.swap(*(one.rounded for one in fitted)),
             order=tuple(order),
-            off=off,
             intervals=judged.estimates.shared_intervals,
             wheel_delay_s=delay,
             ladder=(*below, self._measure(shown, judged.step.errors)),
             without={name: prepared.score(fitted - name, delay).t_mrmse_m for name in shown},
             refused=self._explain_refusals(judged, shown),
         )
-        prepared.remember(changed.acting, judged)
+        prepared.remember(changed.model, judged)
         return self._push(changed)
 
     def _measure(self, effects: tuple[str, ...], errors: Errors) -> results.Step:
@@ -265,7 +239,7 @@ class Session:
         refusals: dict[str, str] = {}
         intervals = judged.estimates.shared_intervals
         if not set(shown) <= set(step.order):
-            before = self.prepared.judge(step.acting).step
+            before = self.prepared.judge(step.model).step
             refusals = explain_refusals(data, before, judged.step, lambda: intervals)
         for name in (name for name in shown if name in step.order):
             why = explain_refusal(judged.step.fitted.model.effect(name), intervals, data.conditions)
@@ -279,7 +253,3 @@ def open_session(prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Sessi
     step = Step(said="ideal model", model=Model(prepared.vehicle), intervals={}, without={}, refused={})
     fitted = Session(prepared, diagnosis, (step,)).fit()
     return Session(prepared, diagnosis, (replace(fitted.step, said=step.said),))
-
-
-def _leave_out(model: Model, off: frozenset[str]) -> Model:
-    return model.keep(set(model.ids) - off)

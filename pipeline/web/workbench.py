@@ -27,7 +27,6 @@ from pipeline.words import describe_end, diagnosis_as_json
 
 _MOST_RUNS = 4
 _MOST_SESSIONS = 8
-_MOST_TRIALS = 20
 
 
 @dataclass
@@ -91,8 +90,7 @@ class Workbench:
         self.jobs = jobs
         self._runs = Newest[PreparedRun](_MOST_RUNS)
         self._sessions = Newest[Session](_MOST_SESSIONS)
-        self._trials = Newest[Trial](_MOST_TRIALS)
-        self._trying: dict[Slot, Trial] = {}
+        self._trials: dict[Slot, Trial] = {}
         self._lock = threading.Lock()
 
     def answer(self, ask: Ask) -> dict[str, object]:
@@ -125,7 +123,7 @@ class Workbench:
             return session.prepared.figures.redraw(session.show(), ask.stretch)
 
     def save(self, ask: Ask) -> dict[str, object]:
-        """Write the model file of a session, without the effects that are switched off.
+        """Write the model file of a session.
 
         The data of its fit are written as well, unless values were set by hand since.
         """
@@ -189,7 +187,6 @@ class Workbench:
             "add": lambda: session.add(ask.effects or [ask.effect], anyway=ask.anyway),
             "formula": add_formula,
             "drop": lambda: session.drop(ask.effect),
-            "switch": lambda: session.switch(ask.effect),
             "set": set_value,
             "preview": set_value,
             "lock": lambda: session.lock(ask.effect, ask.parameter),
@@ -202,27 +199,24 @@ class Workbench:
 
     def _try(self, session: Session, ask: Ask) -> Session:
         """Try further effects; unasked only if nothing that the diagnosis found helps."""
-        if not ask.anyway and any(one["helps"] for one in session.list_offers()):
-            return session
-        key, model = self._key_trial(session, ask)
-        known = self._trials.find(key)
-        if known is None or known.stopped:
-            if ask.slot in self._trying:
-                self._trying[ask.slot].stopped = True
-            trial = self._trying[ask.slot] = self._trials.keep(key, Trial(session.prepared, model))
+        is_asked = ask.anyway or not any(one["helps"] for one in session.list_offers())
+        if is_asked and self._find_trial(session, ask.slot) is None:
+            if ask.slot in self._trials:
+                self._trials[ask.slot].stopped = True
+            trial = Trial(session.prepared, session.begin(session.step.model))
+            self._trials[ask.slot] = trial
             threading.Thread(target=trial.run, daemon=True).start()
         return session
 
-    def _key_trial(self, session: Session, ask: Ask) -> tuple[tuple[object, ...], Model]:
-        step, prepared = session.step, session.prepared
-        model = session.begin(step.acting)
-        key = (ask.slot, ask.run, prepared.manifest.key, prepared.data.source.value, model.effects)
-        return key, model
+    def _find_trial(self, session: Session, slot: Slot) -> Trial | None:
+        """The trial of the current model, if it is the latest of this side of the page."""
+        trial, model = self._trials.get(slot), session.begin(session.step.model)
+        is_its = trial is not None and trial.prepared is session.prepared
+        return trial if trial is not None and is_its and trial.model.effects == model.effects else None
 
     def _show(self, session: Session, ask: Ask) -> dict[str, object]:
         prepared, diagnosis = session.prepared, session.diagnosis
-        trial = self._trials.find(self._key_trial(session, ask)[0])
-        is_there = trial is not None and not (trial.stopped and trial.tried != trial.total)
+        trial = self._find_trial(session, ask.slot)
         return {
             "session": show_session(session),
             "run": summarize_run(prepared.manifest),
@@ -231,7 +225,7 @@ class Workbench:
             "diagnosis": None if diagnosis is None else diagnosis_as_json(diagnosis),
             "named": session.list_offers(),
             "missing": [one.id for one in session.named if one.id not in session.step.order],
-            "trial": trial.show() if trial is not None and is_there else None,
+            "trial": None if trial is None else trial.show(),
         }
 
 
@@ -260,14 +254,12 @@ def show_session(session: Session) -> dict[str, object]:
 def show_card(session: Session, name: str) -> dict[str, object]:
     """Card of one effect of the current model."""
     step, effect = session.step, session.step.model.effect(name)
-    is_fitted = not step.by_hand and name not in step.off
     return {
         **describe_effect(effect, step.model),
-        "off": name in step.off,
         "without_m": step.without.get(name),
         "refused": step.refused.get(name),
         "parameters": [
-            show_parameter(effect, one, step.intervals.get(f"{name}.{one.name}"), is_fitted=is_fitted)
+            show_parameter(effect, one, step.intervals.get(f"{name}.{one.name}"), is_fitted=not step.by_hand)
             for one in effect.parameters
             if math.isfinite(effect.values[one.name])
         ],

@@ -37,7 +37,7 @@ SLOWEST_S = 30.0
 REQUESTS_A_ROUND = 40
 EFFECTS = ("effective_track", "drive_lag", "lateral_skid", "wheel_radius", "own", "magic", "../x", "")
 ACTIONS = (
-    "open", "add", "drop", "switch", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try",
+    "open", "add", "drop", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try",
     "burn",
 )  # fmt: skip
 TEXTS = (
