@@ -66,6 +66,7 @@ def open_page(
 
 def look(chrome: Chrome, picture: Path) -> None:
     """Nothing went wrong, nothing is cut, overlaps or is wider than the screen, and nobody is kept out."""
+    chrome.run("scrollTo(0, 0)")
     chrome.picture(picture, whole=True)
     assert cast("int", chrome.run(WIDER)) <= 0
     for flaws in (CUT, OVERLAPPING, REACHED):
@@ -185,7 +186,7 @@ def test_what_is_refused_is_said_until_the_next_step(chrome: Chrome, served: Ser
     chrome.click(".card .remove")
     chrome.wait(f"!document.querySelector('.card') && {TOAST}.hidden && {SETTLED}")
     write_formula(chrome, effect="mine", formula="c * v0", parameters="c [s] -1 .. 1")
-    chrome.wait(f"{TOAST}.textContent.includes('m/s')")
+    chrome.wait(f"{TOAST}.textContent.includes('rad/s')")
     # The browser notes a refused request by itself.
     assert [text for text in chrome.errors if "422" not in text] == []
 
@@ -260,7 +261,7 @@ def test_two_models_and_their_difference(
     assert rows[1].startswith("heading error over 2 s [\u00b0]")
     first, second, apart = (text.split()[0] for text in rows[1].split("\t")[1:])
     assert float(apart) == pytest.approx(float(second) - float(first), rel=0.01)
-    assert "effective_track.k" in rows[2]
+    assert "effective_track" in rows[2]
     assert "not in it" in rows[2]
     # When they are apart: two lines over time, which follow both models, of one run only.
     lines = "[...document.querySelectorAll('#apart .mark-line path')].map((line) => line.getAttribute('d'))"
