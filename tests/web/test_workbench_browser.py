@@ -240,6 +240,8 @@ def test_add_slide_undo_and_save(
     served.session(RUN, "set", effect="effective_track", parameter="k", value=10.0)
     chrome.run("location.reload()")
     chrome.wait("document.querySelector('.bound')?.innerText.includes('at its bound')")
+    chrome.click(".card .remove")
+    chrome.wait(f"!document.querySelector('.card') && {SETTLED}")
     write_formula(chrome, effect="my_track", formula="k * w0", parameters="k [1] -0.9 .. 0.9")
     chrome.wait("document.querySelector('.card[data-effect=my_track]')")
     look_for_trouble(chrome)
