@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import cast
@@ -293,7 +294,9 @@ def test_an_empty_folder_asks_for_a_log_and_says_what_is_none(
         told = str(chrome.run("document.querySelector('.job.failed').innerText"))
         assert "notes.mcap" in told
         assert str(served.results) not in told
-        chrome.click(".job.failed .drop")
+        # The page reads its lists anew once a job has ended.
+        time.sleep(1.0)
+        chrome.run("document.querySelector('.job.failed .drop').click()")
         chrome.wait("!document.querySelector('.job.failed')")
         chrome.click(".sample")
         chrome.wait("document.querySelector('.job')")
