@@ -181,7 +181,7 @@ def read_length_scale(manifest: Manifest) -> float:
 
 
 WORKBENCH = "workbench"
-"""Folder in the results for data of the workbench: sessions, models and requested diagnoses."""
+"""Folder in the results for data of the workbench: models, requested diagnoses and dropped logs."""
 
 
 UPLOADS = f"{WORKBENCH}/uploads"

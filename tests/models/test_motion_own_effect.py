@@ -16,7 +16,7 @@ from pipeline.models.effect import Effect
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.sources import find_preset
-from pipeline.web.session import list_catalogue
+from pipeline.web.cards import list_catalogue
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "pages").rglob("*.md"))
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
