@@ -130,7 +130,7 @@ def press_in_browser(server: Workbench, run: str) -> None:
             chrome.open(f"{server.address}#a={run}")
             for effect in EFFECTS:
                 chrome.wait(SETTLED)
-                button = f".add[aria-label='add {effect}']"
+                button = f".add[data-keep='add {effect}']"
                 if chrome.run(f"Boolean(document.querySelector({json.dumps(button)}))"):
                     moved = chrome.run(PRESS.replace("BUTTON", json.dumps(button)))
                     print(f"  Add {effect}: {say(moved)}", flush=True)
