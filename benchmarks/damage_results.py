@@ -12,9 +12,10 @@ import os
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
+from unittest import mock
 
 from pipeline.analysis import Options
 from pipeline.batch import Request
@@ -22,7 +23,7 @@ from pipeline.batch.batch_run import run_batch
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store import verification as room
-from pipeline.store.files import do_nothing, hash_bytes
+from pipeline.store.files import hash_file
 
 FLIPS = (0x01, 0x80, 0xFF)
 
@@ -63,37 +64,42 @@ class Table:
         )
 
 
-class Remembering:
-    """The files of results, of which those that have not changed are hashed once."""
+class Files:
+    """The files of results, which are changed one at a time; those that have not changed are hashed once."""
 
-    def __init__(self, files: room.DiskFiles) -> None:
-        self._files = files
-        self._names = files.names(do_nothing)
-        self._contents: dict[str, bytes | None] = {}
-        self._hashes: dict[str, str] = {}
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._hashes: dict[Path, str] = {}
 
-    def change(self, name: str, content: bytes | None) -> None:
-        self._contents[name] = content
-        self._hashes.pop(name, None)
-        self._names = {*self._names, name} if content is not None else set(self._names) - {name}
-
-    def names(self, skip: Callable[[Path, str], None]) -> Iterable[str]:
-        del skip
-        return self._names
+    def list(self) -> list[str]:
+        """Files that hold something: no locks, and nothing that another program keeps there."""
+        names = [path.relative_to(self._root).as_posix() for path in self._root.rglob("*") if path.is_file()]
+        return sorted(
+            name
+            for name in names
+            if not name.endswith(".lock") and "/claims/" not in name and "/latest/" not in name
+        )
 
     def read(self, name: str) -> bytes | None:
-        if name not in self._contents:
-            self._contents[name] = self._files.read(name)
-        return self._contents[name]
+        path = self._root / name
+        return path.read_bytes() if path.is_file() else None
 
-    def hash(self, name: str) -> str:
-        if name not in self._hashes:
-            data = self.read(name)
-            self._hashes[name] = "" if data is None else hash_bytes(data)
-        return self._hashes[name]
+    def change(self, name: str, content: bytes | None) -> None:
+        path = self._root / name
+        self._hashes.pop(path, None)
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
 
-    def locate(self, name: str) -> Path:
-        return self._files.locate(name)
+    def examine(self) -> room.Examination:
+        with mock.patch.object(room, "hash_file", self._hash):
+            return room.examine_results(self._root)
+
+    def _hash(self, path: Path) -> str:
+        if path not in self._hashes:
+            self._hashes[path] = hash_file(path)
+        return self._hashes[path]
 
 
 def make_results(folder: Path) -> Path:
@@ -128,17 +134,17 @@ def name_kind(name: str, current: set[str]) -> str:
     return f"*{Path(name).suffix}" if "/".join(parts[:-1]) in current else _OLD
 
 
-def flip_bytes(files: Remembering, names: list[str], current: set[str], every: int) -> Table:
+def flip_bytes(files: Files, names: list[str], current: set[str], every: int) -> Table:
     """Every byte of JSON, every n-th of other files."""
     table, flips = Table(), cycle(FLIPS)
-    before = room.examine_files(files)
+    before = files.examine()
     for name in sorted(names, key=lambda name: (name_kind(name, current), name)):
         whole = files.read(name)
         if not whole:
             continue
         for at in range(0, len(whole), 1 if whole[:1] == b"{" else every):
             files.change(name, whole[:at] + bytes([whole[at] ^ next(flips)]) + whole[at + 1 :])
-            table.count(name_kind(name, current), room.examine_files(files), before)
+            table.count(name_kind(name, current), files.examine(), before)
         files.change(name, whole)
     return table
 
@@ -146,10 +152,10 @@ def flip_bytes(files: Remembering, names: list[str], current: set[str], every: i
 class Exchange:
     """Files deleted, cut, and put in the place of others, and what was noticed of it."""
 
-    def __init__(self, files: Remembering, names: list[str], current: set[str]) -> None:
+    def __init__(self, files: Files, names: list[str], current: set[str]) -> None:
         self.table = Table()
         self._files, self._names, self._current = files, names, current
-        self._before = room.examine_files(files)
+        self._before = files.examine()
 
     def try_all(self) -> Table:
         for name in self._names:
@@ -185,16 +191,9 @@ class Exchange:
             return
         for name, content in contents.items():
             self._files.change(name, content)
-        self.table.count(kind, room.examine_files(self._files), self._before)
+        self.table.count(kind, self._files.examine(), self._before)
         for name, content in kept.items():
             self._files.change(name, content)
-
-
-def list_contents(files: room.DiskFiles) -> list[str]:
-    """Files that hold something: no locks, and nothing that another program keeps there."""
-    return sorted(
-        name for name in files.names(do_nothing) if not name.endswith(".lock") and "/claims/" not in name
-    )
 
 
 def damage_all(every: int) -> int:
@@ -203,10 +202,10 @@ def damage_all(every: int) -> int:
     try:
         out = make_results(folder)
         store = Store(out)
-        files = Remembering(room.DiskFiles(out))
+        files = Files(out)
         current = {manifest.folder.relative_to(out).as_posix() for manifest in store.manifests()}
-        found = room.examine_files(files)
-        names = [name for name in list_contents(files) if name not in found.unchecked]
+        found = files.examine()
+        names = [name for name in files.list() if name not in found.unchecked]
         names = [name for name in names if name_kind(name, current) != _OLD]
         print(f"{len(names)} files, ", end="")
         print(f"{sum(len(files.read(name) or b'') for name in names)} bytes; ", end="")

@@ -6,6 +6,7 @@ the lead is the time from the first alarm of digging in until the vehicle stands
 """
 
 import argparse
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -20,14 +21,15 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
-    Incident,
-    IncidentKind,
     PoseSensor,
     Program,
     Scenario,
-    simulate_run,
     write_log,
 )  # fmt: skip
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
+
+from incidents import Incident, IncidentKind, simulate_incidents
 
 KINDS: tuple[IncidentKind, ...] = (
     "digging_in", "stuck", "spinning", "sliding", "emergency_stop", "manual_driving",
@@ -47,7 +49,7 @@ KNOWN = {
 """Events of the recordings that were looked at one by one, and are none of false alarms."""
 
 
-def draw(seed: int) -> Scenario:
+def draw(seed: int) -> tuple[Scenario, Incident]:
     """A drive with one event in its midst; long enough for the vehicle to show what is usual."""
     draws = np.random.default_rng([38, seed])
     kind = KINDS[seed % len(KINDS)]
@@ -56,7 +58,7 @@ def draw(seed: int) -> Scenario:
     name = str(draws.choice(["husky", "warthog", "jackal"]))
     noise = float(draws.choice([0.001, 0.003]))
     # Before an event the vehicle drives straight ahead, as one that digs in does.
-    return Scenario(
+    scenario = Scenario(
         vehicle=VEHICLES[name],
         seed=seed,
         duration_s=130.0,
@@ -64,17 +66,16 @@ def draw(seed: int) -> Scenario:
         pose=PoseSensor(rate_hz=float(draws.choice([20.0, 50.0])), noise_m=noise, noise_rad=0.5 * noise),
         disturbance=Disturbance(0.03, 0.05),
         effects={"effective_track": {"k": 1.5}, "drive_lag": {"tau": float(draws.uniform(0.1, 0.4))}},
-        incidents=(Incident(kind, start, start + length),),
     )
+    return scenario, Incident(kind, start, start + length)
 
 
-def find_event(scenario: Scenario, scratch: Path) -> dict[str, object] | None:
+def find_event(scenario: Scenario, incident: Incident, scratch: Path) -> dict[str, object] | None:
     """What a drive's event became: its kind, delays of its begin and its alarm [s], the lead, others found.
 
     None where the vehicle did not drive straight ahead when it began, so that nothing showed.
     """
-    (incident,) = scenario.incidents
-    made = simulate_run(scenario)
+    made = simulate_incidents(scenario, incident)
     drive, step = made.truth.drive, made.truth.drive.step_s
     radius = scenario.vehicle.wheel_radius_m
     wanted = slice(int((incident.start_s - 2.0) / step), int((incident.start_s + 4.0) / step))
@@ -113,7 +114,7 @@ def play(count: int, seed: int) -> Iterator[str]:
     results: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as scratch:
         while len(results) < count:
-            found = find_event(draw(seed), Path(scratch))
+            found = find_event(*draw(seed), Path(scratch))
             seed += 1
             if found is not None:
                 results.append(found)

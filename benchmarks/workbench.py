@@ -9,7 +9,6 @@ question with nothing kept ready: tables, grid and score anew.
 import argparse
 import json
 import os
-import shutil
 import statistics
 import sys
 import tempfile
@@ -35,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 from collections.abc import Callable
 
 from chrome import BROWSER, Chrome
-from workbench_server import Workbench
+from workbench_server import ServedWorkbench as Workbench
 
 from pipeline.store import Manifest
 
@@ -131,7 +130,7 @@ def press_in_browser(server: Workbench, run: str) -> None:
             chrome.open(f"{server.address}#a={run}")
             for effect in EFFECTS:
                 chrome.wait(SETTLED)
-                button = f".add[aria-label='add {effect}']"
+                button = f".add[data-keep='add {effect}']"
                 if chrome.run(f"Boolean(document.querySelector({json.dumps(button)}))"):
                     moved = chrome.run(PRESS.replace("BUTTON", json.dumps(button)))
                     print(f"  Add {effect}: {say(moved)}", flush=True)
@@ -190,7 +189,6 @@ def run(chosen: argparse.Namespace) -> None:
         finally:
             server.close()
         if BROWSER is not None:
-            shutil.rmtree(options.out / "workbench")
             # A server that has fitted nothing yet.
             server = Workbench(options.out)
             try:

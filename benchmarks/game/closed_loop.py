@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from pipeline.simulate import Disturbance, Scenario, State, simulate_run
-from pipeline.simulate.messages import Truth
+from pipeline.simulate.run import Truth
 from pipeline.simulate.scenario import Commands
 
 _STEP_S = 0.01

@@ -410,7 +410,8 @@ def _draw_joint(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
         for number, late in enumerate(clocks)
     ]
     # Without encoders and odometry a clock and the drive's delay are one number.
-    told = LAYOUTS[scene.recording.layout].wheels or scene.recording.decoys != "none"
+    layout = LAYOUTS[scene.recording.layout]
+    told = scene.recording.decoys != "none" or any("wheels" in row.values() for row in layout.topics)
     alike = 0.0 if told else asked.get("transport_delay", {}).get("d", 0.0)
     seen = [late + alike for late in clocks]
     asked["clock_offset"] = {"d": seen[0]}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulate import Disturbance, Ground, Scenario, SimulatedRun, simulate_run
-from pipeline.simulate.messages import record_truth
+from pipeline.simulate.run import record_truth
 
 Floats = NDArray[np.float64]
 

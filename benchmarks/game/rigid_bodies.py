@@ -22,9 +22,9 @@ from pipeline.core import (
 )
 from pipeline.simulate.drivetrain import apply_ideal_model
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle, resolve_effects
-from pipeline.simulate.messages import SimulatedRun, Truth, ask_wheels, record_truth
-from pipeline.simulate.path import BodyMotion, Path
-from pipeline.simulate.scenario import Drive, Scenario
+from pipeline.simulate.path import Path
+from pipeline.simulate.run import SimulatedRun, Truth, ask_wheels, record_truth
+from pipeline.simulate.scenario import BodyMotion, Drive, Scenario
 
 _STEP_S = 0.002
 _SETTLE_STEPS = 500
@@ -119,7 +119,7 @@ def _refuse_formulas(scenario: Scenario, effects: Effects) -> None:
         what = "only skid-steer vehicles are built of rigid bodies"
         hint = "Choose a differential vehicle"
         raise SimulateError("wrong_vehicle", what, where=scenario.vehicle.name, hint=hint)
-    wrong = [name for name in effects.as_mapping() if name not in _ALLOWED]
+    wrong = [name for name in effects.asked if name not in _ALLOWED]
     if scenario.extra is not None:
         wrong.append("extra")
     if scenario.ground.hill_m > 0.0:

@@ -40,6 +40,7 @@ from game.score import TRUTH_FORMAT
 from pipeline.simulate import (
     LAYOUTS,
     Encoders,
+    Layout,
     Recording,
     Scenario,
     SimulatedRun,
@@ -74,7 +75,6 @@ POSITION_STEP, TURN_STEP, GYRO_STEP, FORCE_STEP, WHEEL_STEP = (
 )
 _TICK_S = 1e-4
 _DIGITS = 6
-_COMMANDS = {"ackermann": ("ackermann", "/ackermann_cmd")}
 
 # What contact does to any skid-steer made of rigid bodies, beside what was built into it. Scrub slows the
 # wheels, too, as their controllers have no integral part: the encoders' difference falls .067 rad/s short of
@@ -180,14 +180,10 @@ def write_task(riddle: Riddle, name: str, folder: Path, salt: str) -> Json:
 def _plain(scene: Scenario) -> Scenario:
     """The same scene with the same topics as every other, and no longer than a task is."""
     kind = scene.vehicle.kind
-    form, topic = _COMMANDS.get(kind, ("twist_stamped", "/cmd_vel"))
-    base = LAYOUTS["ackermann" if kind == "ackermann" else "mecanum"]
-    layout = replace(
-        base,
-        kind=kind,
-        commands=(replace(base.commands[0], form=form, topics=(topic,)),),  # type: ignore[arg-type]
-        pose=replace(base.pose, topic="/localization/odometry"),
-    )
+    base = LAYOUTS["ackermann" if kind == "ackermann" else "mecanum"].topics
+    command = base[0] if kind == "ackermann" else {"twist": "/cmd_vel", "stamped": True, "frame": "base_link"}
+    pose_row = {"odometry": "/localization/odometry", "source": "localization", "parent": "map", "child": ""}
+    layout = Layout(kind, (command, base[1], pose_row, base[3]))
     pose = replace(scene.pose, rate_hz=min(scene.pose.rate_hz, _POSES_HZ), noise_z_m=0.0, noise_tilt_rad=0.0)
     return replace(
         scene,

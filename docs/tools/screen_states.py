@@ -1,6 +1,6 @@
 """What screenshots.py looks at, and the states of the workbench with what a person does to reach them."""
 
-import shutil
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,13 @@ _SETTLED = (
     f"document.querySelector('.pane')?.dataset.drawn && !document.querySelector('.pane.busy, .trying')"
     f" && {_PLOTS}"
 )
+# Every state begins with the ideal model on both sides.
+_FORGET = """(async () => {
+  for (const slot of ["a", "b"]) for (let undo = ""; undo !== null; ) {
+    const body = JSON.stringify({ run: RUN, slot, action: "undo" });
+    undo = (await (await fetch("/api/session", { method: "POST", body })).json()).session.undo;
+  }
+})()"""
 _REFUSED = "document.querySelector('.verdict.refused')"
 
 
@@ -56,7 +63,7 @@ def list_states(address: str, results: Path, log: Path, text: Path) -> list[Scre
 
     Args:
         address: of the workbench, with its token.
-        results: its results folder, whose sessions are forgotten before each state.
+        results: its results folder.
         log: that is dropped on the page.
         text: a file that is no log, dropped there, too.
     """
@@ -65,7 +72,7 @@ def list_states(address: str, results: Path, log: Path, text: Path) -> list[Scre
 
     def show(name: str, opened: str, *acts: Callable[[Chrome], None], said: str = "") -> Screen:
         def act(chrome: Chrome) -> None:
-            shutil.rmtree(results / "workbench" / "desks", ignore_errors=True)
+            chrome.run(_FORGET.replace("RUN", json.dumps(opened)))
             # The page that is left would be taken for the one that comes.
             chrome.run("window.left = true; location.reload()")
             chrome.wait(f"!window.left && document.readyState === 'complete' && ({_SETTLED})")

@@ -108,7 +108,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
     current = store.manifest(run)
-    if current is not None and store.is_asked_again(current):
+    if current is not None and current.again:
         options = _ask_as_before(options, current)
     twin = _find_twin(path, sha256, current)
     if current is not None and not options.force and _is_done(current, keys, options):

@@ -23,7 +23,7 @@ from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.recording.log_setup import LogSetup
 from pipeline.results import Finding, RunDiagnosis, find_refusal, read_findings, read_result, to_json
 from pipeline.stages import SUMMARY_DIGITS, list_wanted, pick_row, round_number, summarize_inputs
-from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store, StoreError, load_manifest
+from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store
 
 _Packages = Mapping[str, tuple[str, ...]]
 _ALWAYS = ("numpy", "scipy", "polars", "pyarrow", "rosbags")
@@ -219,20 +219,14 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         store: the results.
         summary: summary of the run itself.
     """
-    run_dirs = store.run_dirs()
-    if summary.get("terrain") in (None, "", "unknown") or len(run_dirs) > _MOST_RUNS:
+    if summary.get("terrain") in (None, "", "unknown") or len(store.run_dirs()) > _MOST_RUNS:
         return {}
     seen = {mapping_in(summary, "log").get("sha256")}
     medians: dict[str, list[float]] = {}
-    for home in run_dirs:
-        try:
-            manifest = load_manifest(home)
-        except (StoreError, OSError):
-            # Listing the runs reports the error; a report does not need this run.
-            continue
-        if manifest is None or manifest.run == summary.get("run"):
-            continue
-        if manifest.details.get("dataset") != summary.get("dataset"):
+    # Listing the runs reports those that cannot be read; a report does not need them.
+    for manifest in store.survey().manifests:
+        is_same = manifest.run == summary.get("run")
+        if is_same or manifest.details.get("dataset") != summary.get("dataset"):
             continue
         other = read_object(manifest.path(SUMMARY)) if SUMMARY in manifest.files else {}
         sha256 = manifest.part("log").get("sha256")

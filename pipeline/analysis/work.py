@@ -33,7 +33,7 @@ from pipeline.store import (
     CheckedTable,
     Generation,
     Manifest,
-    TableReport,
+    TableEntry,
     check_table,
     hash_json,
     stored_contexts,
@@ -151,7 +151,7 @@ class Work:
         frame = tabulate_findings(stage, findings)
         self.findings.append(self._identify("findings", frame))
 
-    def write(self, table: str, frame: pl.DataFrame) -> TableReport:
+    def write(self, table: str, frame: pl.DataFrame) -> TableEntry:
         """Write a table of this run, with the columns that identify the run, and the facts it declares."""
         facts: dict[str, float] = {}
         if wanted := contract_of(table).facts:

@@ -19,9 +19,8 @@ from pipeline.store import (
     Store,
     StoreError,
     Tally,
-    check_home,
     encode_run,
-    load_manifest,
+    list_old,
 )
 
 _UNREADABLE = {"manifest_damaged", "name_clash"}
@@ -59,11 +58,14 @@ def repair_results(
     repairs = [_repair_file(store, problem) for problem in examination.problems if not problem.home]
     entries = Ledger(store).read_all().values()
     logs = {f"{RUNS}/{encode_run(entry.run)}": entry.log.path for entry in entries if entry.run}
+    manifests = {one.home: one for one in store.survey().manifests}
     of_runs = sorted((each for each in examination.problems if each.home), key=lambda each: each.home)
     for home, some in groupby(of_runs, key=lambda each: each.home):
         problems = list(some)
         codes = {problem.code for problem in problems}
-        action, what = _repair_run(store, home, codes, logs.get(home, ""), follow_remote=follow_remote)
+        manifest = manifests.get(store.root / home)
+        log = logs.get(home, "") or ("" if manifest is None else str(manifest.part("log").get("path") or ""))
+        action, what = _repair_run(store, home, codes, (manifest, log), follow_remote=follow_remote)
         repairs.append(Repair(subject=problems[0].run, action=action, what=what))
     return tuple(repairs)
 
@@ -78,15 +80,14 @@ def _repair_file(store: Store, problem: Problem) -> Repair:
 
 
 def _repair_run(
-    store: Store, home: str, codes: set[str], log: str, *, follow_remote: bool
+    store: Store, home: str, codes: set[str], known: tuple[Manifest | None, str], *, follow_remote: bool
 ) -> tuple[str, str]:
-    """Action and its text for the problems of a run; ``log`` is where the notes of batches saw its log."""
-    if "manifest_too_new" in codes:
-        return "left", "a newer version wrote it: use that one"
+    """Action and its text for the problems of a run, whose manifest and path of the log are known."""
+    if "other_version" in codes:
+        return "left", "another version of slip wrote it: use that one"
     if codes == {"extra_file"}:
         return "left", "all that was written is intact; remove the files that were not written with it"
-    manifest = _read_manifest(store, home)
-    log = log or ("" if manifest is None else str(manifest.part("log").get("path") or ""))
+    manifest, log = known
     try:
         location = locate_recorded(log, follow_remote=follow_remote) if log else None
     except LogError as error:
@@ -100,18 +101,6 @@ def _repair_run(
     elif manifest is not None:
         store.ask_again(manifest)
     return "queued", f"the next batch over {log} makes it again"
-
-
-def _read_manifest(store: Store, home: str) -> Manifest | None:
-    """Manifest in the folder of a run; None if there is none, or none of that run."""
-    path = store.root / home
-    try:
-        manifest = load_manifest(path)
-        if manifest is not None:
-            check_home(manifest.run, path, top=store.root / RUNS)
-    except (StoreError, OSError):
-        return None
-    return manifest
 
 
 _NOT_FOLLOWED = "remote_not_followed"
@@ -268,7 +257,7 @@ def read_status(store: Store) -> Status:
         entries=entries,
         counts={state: states.count(state) for state in _COUNTED},
         bytes=size,
-        old_generations=sum(len(manifest.earlier) for manifest in survey.manifests),
+        old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),
         last=max((entry.at for entry in entries), default=None),
     )

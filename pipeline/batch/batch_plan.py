@@ -14,7 +14,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
-from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
+from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger, Task
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
@@ -149,108 +149,77 @@ def name_runs(
     return runs, copies
 
 
-@dataclass(frozen=True, kw_only=True)
-class Item:
-    """One log of a batch.
-
-    Attributes:
-        path: the recording.
-        log: state of its file; empty if it cannot be read.
-        fingerprint: hash of everything else its results depend on.
-        before: previous ledger entry, whether or not the log has changed since.
-        run: name of its run; empty until it is assigned.
-        copy_of: run of the same content, if the log is a copy.
-    """
-
-    path: Path
-    log: LogSighting
-    fingerprint: str
-    before: Entry | None = None
-    run: str = ""
-    copy_of: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Work to be done.
-
-    Attributes:
-        todo: logs to work on.
-        settled: logs to skip, with their entries: done, copies, quarantined.
-    """
-
-    todo: tuple[Item, ...]
-    settled: tuple[Entry, ...]
-
-
-def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
+def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
     """Compare the logs with the results.
 
     Args:
         paths: recordings, absolute, sorted.
         store: the results.
         request: options of the user.
+
+    Returns:
+        The logs to work on, the largest first, so that no worker starts it when the others have finished; and
+        the entries of those to skip: done, copies, quarantined.
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
-    asked_again = {run for run, manifest in manifests.items() if store.is_asked_again(manifest)}
     hasher = Fingerprinter(request.options)
-    items = [_look_at(path, hasher, ledger) for path in paths]
-    settled: list[Entry] = []
-    open_items: list[Item] = []
-    for item in items:
-        entry = item.before
-        is_asked_again = entry is not None and entry.run in asked_again
-        if entry is not None and not is_asked_again and _is_settled(item, entry, manifests, request):
-            settled.append(entry)
-        else:
-            open_items.append(item)
-    named = _name_items(open_items, items, manifests, store)
-    for item in named:
-        if item.copy_of:
-            entry = Entry(log=item.log, fingerprint=item.fingerprint, state="copy", reason=item.copy_of)
+    tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
+    settled = [task.before for task in tasks if task.before and _is_settled(task, manifests, request)]
+    done = {entry.log.path for entry in settled}
+    runs, copies = _name_tasks([task for task in tasks if task.log.path not in done], tasks, manifests, store)
+    todo: list[Task] = []
+    for task in tasks:
+        if task.path in copies:
+            reason = copies[task.path]
+            entry = Entry(log=task.log, fingerprint=task.fingerprint, state="copy", reason=reason)
             Ledger(store).write(entry)
             settled.append(entry)
-    todo = (item for item in named if not item.copy_of)
-    # Largest logs first, so that no worker starts the largest one when the others have finished.
-    return Plan(
-        todo=tuple(sorted(todo, key=lambda item: (-item.log.size, item.path))), settled=tuple(settled)
-    )
+        elif task.log.path not in done:
+            todo.append(replace(task, options=replace(task.options, run=runs.get(task.path, ""))))
+    return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled
 
 
-def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry]) -> Item:
+def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options) -> Task:
     # Unreadable logs are processed all the same: this reports what is wrong with them.
     log, fingerprint = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
     with suppress(OSError, SlipError):
         log = see_log(path)
         fingerprint = hasher.find_fingerprint(path)
-    return Item(path=path, log=log, fingerprint=fingerprint, before=ledger.get(log.path))
+    before = ledger.get(log.path)
+    return Task(path=path, log=log, fingerprint=fingerprint, options=options, before=before)
 
 
-def _is_settled(item: Item, entry: Entry, manifests: Mapping[str, Manifest], request: Request) -> bool:
-    if not entry.fits(item.log, item.fingerprint) or request.options.force:
+def _is_settled(task: Task, manifests: Mapping[str, Manifest], request: Request) -> bool:
+    """Whether there is nothing to do for a log that a batch has seen before."""
+    entry = task.before
+    if entry is None or not entry.fits(task.log, task.fingerprint) or request.options.force:
+        return False
+    manifest = manifests.get(entry.run)
+    if manifest is not None and manifest.again:
         return False
     if entry.state == "quarantined":
         return not request.retries_quarantined
     if entry.state == "copy":
         return entry.reason in manifests
-    if entry.state not in WITH_RESULTS:
+    if entry.state not in WITH_RESULTS or manifest is None:
         return False
-    manifest = manifests.get(entry.run)
-    is_current = manifest is not None and manifest.key == entry.key
-    return is_current and (entry.has_report or not request.options.report)
+    return manifest.key == entry.key and (entry.has_report or not request.options.report)
 
 
-def _name_items(
-    open_items: Sequence[Item], items: Sequence[Item], manifests: Mapping[str, Manifest], store: Store
-) -> list[Item]:
+def _name_tasks(
+    todo: Sequence[Task], tasks: Sequence[Task], manifests: Mapping[str, Manifest], store: Store
+) -> tuple[dict[Path, str], dict[Path, str]]:
+    """Runs of the logs to work on, and of those that are copies the run of the same content."""
     identities = LogIdentities(store)
     logs = {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
     paths = {run: str(to_location(str(log.get("path")))) for run, log in logs.items()}
-    runs = {path: run for run, path in paths.items()}
-    runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
-    new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
-    locations = {item.log.path: item.path for item in items}
+    known_runs = {path: run for run, path in paths.items()}
+    known_runs |= {
+        task.log.path: task.before.run for task in tasks if task.before and task.before.run in manifests
+    }
+    new = {task.path: task.log.size for task in todo if task.log.path not in known_runs}
+    locations = {task.log.path: task.path for task in tasks}
     known = [
         KnownRun(run, str(log.get("sha256")), size)
         for run, log in logs.items()
@@ -273,14 +242,7 @@ def _name_items(
         return location is not None and find_hash(location) == logs[run].get("sha256")
 
     named, copies = name_runs(new, known, find_hash, is_present)
-    return [
-        replace(
-            item,
-            run=runs.get(item.log.path) or named.get(item.path, ""),
-            copy_of=copies.get(item.path, ""),
-        )
-        for item in open_items
-    ]
+    return named | {task.path: run for task in todo if (run := known_runs.get(task.log.path))}, copies
 
 
 _NOTES = "batch/pooled"
@@ -292,28 +254,21 @@ _VERSION = 2
 """Version of the pooled files; increase it when their generation changes."""
 
 
-def refresh_pools(store: Store) -> bool:
+def refresh_pools(store: Store) -> None:
     """Update `datasets.parquet`, the catalogue, and the fleet model and trend if they were requested.
 
     Other batches may add runs meanwhile: it is repeated until the pooled runs are the current ones, so that
     the last batch to finish leaves the right tables.
-
-    Returns:
-        Whether any file was written.
     """
     notes = store.notes(_NOTES)
-    written = False
+    are_there = all((store.root / name).exists() for name in POOLED)
+    pooled = (notes.read(_NOTE) or {}).get("runs") if are_there else None
     for _ in range(_MOST_ROUNDS):
-        runs = _hash_runs(store)
-        are_there = all((store.root / name).exists() for name in POOLED)
-        if are_there and (notes.read(_NOTE) or {}).get("runs") == runs:
-            return written
-        _write_pools(store)
-        written = True
-        if _hash_runs(store) == runs:
-            notes.write(_NOTE, {"runs": runs})
-            return written
-    return written
+        if (runs := _hash_runs(store)) == pooled:
+            return
+        update_datasets(store)
+        notes.write(_NOTE, {"runs": runs})
+        pooled = runs
 
 
 def forget_pools(store: Store) -> None:
@@ -330,24 +285,7 @@ def _hash_runs(store: Store) -> str:
     return hash_json([_VERSION, contract_of("datasets").version, runs, list_failed(store)])
 
 
-def _write_pools(store: Store) -> None:
-    update_datasets(store)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pruned:
-    """Result of pruning.
-
-    Attributes:
-        removed: removed folders of generations.
-        problems: why the results still exceed the quota, and which of them were not measured.
-    """
-
-    removed: tuple[Path, ...]
-    problems: tuple[SlipError, ...] = ()
-
-
-def prune_results(store: Store, pruning: Pruning) -> Pruned:
+def prune_results(store: Store, pruning: Pruning) -> tuple[int, list[SlipError]]:
     """Remove generations that are not current.
 
     First, all but the newest `keep` of each run are removed. If the results still exceed the quota, the
@@ -357,25 +295,26 @@ def prune_results(store: Store, pruning: Pruning) -> Pruned:
         store: the results.
         pruning: number to keep, and quota.
 
+    Returns:
+        How many were removed; and why the results still exceed the quota, and what was not measured.
+
     Raises:
         StoreError: a run is being written for too long, or the disk reports an error.
     """
-    removed = list(store.prune(pruning.keep))
-    if pruning.quota_bytes is None:
-        return Pruned(removed=tuple(removed))
-    keep = pruning.keep
-    size, errors = measure_results(store)
-    while size > pruning.quota_bytes and keep > 0:
-        keep -= 1
-        removed += store.prune(keep)
+    removed, quota = 0, pruning.quota_bytes
+    size, problems = 0, list[SlipError]()
+    for keep in range(pruning.keep, -1, -1):
+        removed += len(store.prune(keep))
+        if quota is None:
+            return removed, []
         size, errors = measure_results(store)
-    problems: list[SlipError] = [*errors]
-    if size > pruning.quota_bytes:
-        held, quota = (f"{one / 1e9:.3g} GB" for one in (size, pruning.quota_bytes))
-        what = f"the results hold {held} without any old generation, more than {quota}"
-        hint = "Raise --quota, or move runs elsewhere"
-        problems.append(BatchError("over_quota", what, where=str(store.root), hint=hint))
-    return Pruned(removed=tuple(removed), problems=tuple(problems))
+        problems = [*errors]
+        if size <= quota:
+            return removed, problems
+    held, most = (f"{one / 1e9:.3g} GB" for one in (size, quota or 0))
+    what = f"the results hold {held} without any old generation, more than {most}"
+    hint = "Raise --quota, or move runs elsewhere"
+    return removed, [*problems, BatchError("over_quota", what, where=str(store.root), hint=hint)]
 
 
 def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from pipeline.batch import Request, Shard
-from pipeline.batch.batch_plan import Item, make_plan, prune_results, refresh_pools
+from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, WITH_RESULTS, Entry, Ledger, Report, Task, work_on
-from pipeline.batch.executors import Executor, Limits, find_blame, open_executor
+from pipeline.batch.executors import Limits, find_blame, open_executor
 from pipeline.batch.recordings import find_recordings
 from pipeline.core import SlipError
 from pipeline.store import Store
@@ -85,11 +85,12 @@ class Outcome:
     problems: tuple[SlipError, ...] = ()
     removed: int = 0
     notified: tuple[str, ...] = ()
-    counts: Mapping[str, int] = field(init=False)
 
-    def __post_init__(self) -> None:
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many logs came out how."""
         states = [line.state for line in self.lines]
-        object.__setattr__(self, "counts", {state: states.count(state) for state in STATES})
+        return {state: states.count(state) for state in STATES}
 
     @property
     def has_failed(self) -> bool:
@@ -119,10 +120,10 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    plan = make_plan(listed.recordings, store, request)
-    todo = _select(plan.todo, request.shard)
-    watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
-    lines = [*map(_settle, plan.settled)]
+    planned, settled = make_plan(listed.recordings, store, request)
+    todo = _select(planned, request.shard)
+    watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
+    lines = [*map(_settle, settled)]
 
     def note(report: Report) -> None:
         entry = report.entry
@@ -146,49 +147,43 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
 
 
 def _work_through(
-    todo: Sequence[Item], request: Request, work: Callable[[Task], Report], note: Callable[[Report], None]
-) -> Sequence[Item]:
+    todo: Sequence[Task], request: Request, work: Callable[[Task], Report], note: Callable[[Report], None]
+) -> Sequence[Task]:
     """Process logs, in their order; those that were not started after an error that affects all."""
     if not todo:
         return ()
     limits = Limits(request.timeout_s, request.memory_bytes)
     executor = open_executor(request.executor, work, limits, min(request.jobs, len(todo)))
     ledger = Ledger(Store(request.options.out))
-    queue, suspects = deque(todo), deque[Item]()
-    flying: dict[Future[Report], tuple[Item, Task]] = {}
+    queue, suspects = deque(todo), deque[Task]()
+    flying: dict[Future[Report], Task] = {}
     is_stopped = False
     try:
         while flying or ((queue or suspects) and not is_stopped):
             while queue and len(flying) < executor.depth and not is_stopped:
-                _submit(queue.popleft(), request, executor, flying)
+                task = queue.popleft()
+                flying[executor.submit(task)] = task
             if suspects and not flying and not is_stopped:
-                _submit(suspects.popleft(), request, executor, flying)
+                task = suspects.popleft()
+                flying[executor.submit(task)] = task
             for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                item, task = flying.pop(future)
+                task = flying.pop(future)
                 try:
                     report = future.result()
                 except (Exception, CancelledError) as error:  # noqa: BLE001 - whatever a worker can die of
                     report = Report(entry=_judge(task, *find_blame(task, error), ledger))
                     if report.entry.kills == 1:
-                        (suspects if executor.spreads_blame else queue).append(item)
+                        (suspects if executor.spreads_blame else queue).append(task)
                         continue
                 if report.is_busy:
                     time.sleep(_BUSY_PAUSE_S)
-                    queue.append(item)
+                    queue.append(task)
                     continue
                 is_stopped |= report.entry.code in STOPPING
                 note(report)
     finally:
         executor.close()
     return (*queue, *suspects)
-
-
-def _submit(
-    item: Item, request: Request, executor: Executor, flying: dict[Future[Report], tuple[Item, Task]]
-) -> None:
-    options = replace(request.options, run=item.run)
-    task = Task(path=item.path, log=item.log, fingerprint=item.fingerprint, options=options)
-    flying[executor.submit(task)] = (item, task)
 
 
 def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
@@ -201,7 +196,7 @@ def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
         log=task.log,
         fingerprint=task.fingerprint,
         state="quarantined" if quarantined else "failed",
-        run=task.options.run or "",
+        run=task.run,
         code=code,
         reason=f"{reason}; {kills} times" if quarantined else reason,
         hint="It is skipped until it changes; --retry-quarantined tries it again"
@@ -220,22 +215,21 @@ def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int
     try:
         refresh_pools(store)
         if request.pruning is not None:
-            pruned = prune_results(store, request.pruning)
-            removed = len(pruned.removed)
-            problems += pruned.problems
+            removed, unmet = prune_results(store, request.pruning)
+            problems += unmet
     except SlipError as error:
         problems.append(error)
     every = {str(problem): problem for problem in (*problems, *store.survey().errors)}
     return tuple(every.values()), removed
 
 
-def _select(todo: Sequence[Item], shard: Shard | None) -> list[Item]:
+def _select(todo: Sequence[Task], shard: Shard | None) -> list[Task]:
     """Logs of this machine: selected by the run's name, so that machines need no communication."""
     if shard is None:
         return list(todo)
-    digests = [hashlib.sha256(item.run.encode()).digest() for item in todo]
+    digests = [hashlib.sha256(task.run.encode()).digest() for task in todo]
     numbers = [int.from_bytes(digest[:8], "big") % shard.count + 1 for digest in digests]
-    return [item for item, number in zip(todo, numbers, strict=True) if number == shard.number]
+    return [task for task, number in zip(todo, numbers, strict=True) if number == shard.number]
 
 
 def _settle(entry: Entry) -> Line:

@@ -96,7 +96,7 @@ class Ledger:
         self._notes.write(entry.log.path, content)
 
 
-def _as_entry(content: Mapping[str, JSON]) -> Entry | None:
+def _as_entry(content: Mapping[str, object]) -> Entry | None:
     try:
         return msgspec.convert(content, Entry)
     except msgspec.ValidationError:
@@ -110,15 +110,22 @@ class Task:
 
     Attributes:
         path: the recording.
-        log: state of its file when the batch was planned.
+        log: state of its file when the batch was planned; empty if it cannot be read.
         fingerprint: hash of everything else the results depend on.
         options: options of the analysis, including the name of its run.
+        before: previous ledger entry, whether or not the log has changed since.
     """
 
     path: Path
     log: LogSighting
     fingerprint: str
     options: Options
+    before: Entry | None = None
+
+    @property
+    def run(self) -> str:
+        """Name of its run; empty if it has none yet."""
+        return self.options.run or ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +150,7 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
         work: function to call.
         task: its task.
     """
-    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.options.run or "")
+    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.run)
     try:
         report = work(task)
         pickle.dumps(report)
@@ -158,7 +165,7 @@ def work_on(task: Task) -> Report:
     """Analyze one log and record the outcome in the ledger; no log can make it raise."""
     store = Store(task.options.out)
     started = time.monotonic()
-    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.options.run or "")
+    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.run)
     is_new = False
     try:
         with store.claim(entry.run) as is_ours:

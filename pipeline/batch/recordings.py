@@ -7,11 +7,11 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import TypeVar
 
 from pipeline.batch import BatchError
@@ -44,34 +44,13 @@ class Folder:
         path: absolute, links resolved.
         folders: subfolders by name; absolute, links resolved.
         files: regular files, likewise.
+        identity: that no other folder has.
     """
 
     path: Path
     folders: Mapping[str, Path]
     files: Mapping[str, Path]
-
-
-class _Helper:
-    """Thread that can be abandoned: a call to a dead mount does not return."""
-
-    def __init__(self) -> None:
-        self._asked: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._answers: SimpleQueue[tuple[object, Exception | None]] = SimpleQueue()
-        threading.Thread(target=self._work, name="folders", daemon=True).start()
-
-    def ask(self, question: Callable[[], object], patience_s: float) -> object:
-        self._asked.put(question)
-        answer, error = self._answers.get(timeout=patience_s)
-        if error is not None:
-            raise error
-        return answer
-
-    def _work(self) -> None:
-        while True:
-            try:
-                self._answers.put((self._asked.get()(), None))
-            except Exception as error:  # noqa: BLE001 - it is raised where it was asked
-                self._answers.put((None, error))
+    identity: tuple[int, int]
 
 
 @dataclass
@@ -85,17 +64,24 @@ class Looker:
 
     patience_s: float
     skipped: list[Skipped] = field(default_factory=list)
-    _helper: _Helper = field(default_factory=_Helper)
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
         """Result of a query about a path; None, with a note in `skipped`, if there is none."""
+        answer: Future[Answer] = Future()
+
+        def work() -> None:
+            try:
+                answer.set_result(question())
+            except Exception as error:  # noqa: BLE001 - it is raised where it was asked
+                answer.set_exception(error)
+
+        # A thread that can be abandoned: a call to a dead mount does not return.
+        threading.Thread(target=work, name="folders", daemon=True).start()
         try:
-            return self._helper.ask(question, self.patience_s)  # type: ignore[return-value]
-        except Empty:
-            self._helper = _Helper()
-            self.skip(
-                path, f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
-            )
+            return answer.result(self.patience_s)
+        except TimeoutError:
+            why = f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
+            self.skip(path, why)
         except OSError as error:
             self.skip(path, f"it cannot be read ({error.strerror or error})")
         return None
@@ -109,11 +95,10 @@ class Looker:
         seen: set[tuple[int, int]] = set()
 
         def look(path: Path) -> tuple[Folder, list[Path], int] | None:
-            looked = self._look_into(path)
-            if looked is None or looked[0] in seen:
+            folder = self._look_into(path)
+            if folder is None or folder.identity in seen:
                 return None
-            seen.add(looked[0])
-            folder = looked[1]
+            seen.add(folder.identity)
             return folder, list(folder.folders.values()), len(folder.folders) + len(folder.files)
 
         return walk_tree(top, look, self.skip)
@@ -139,18 +124,17 @@ class Looker:
             if self.ask(inner, inner.exists):
                 yield from self._expand(inner, parts[1:])
             return
-        looked = self._look_into(base)
-        if looked is not None:
-            here = {**looked[1].folders, **(looked[1].files if len(parts) == 1 else {})}
+        if (inside := self._look_into(base)) is not None:
+            here = {**inside.folders, **(inside.files if len(parts) == 1 else {})}
             for name in sorted(fnmatch.filter(here, parts[0])):
                 yield from self._expand(here[name], parts[1:])
 
-    def _look_into(self, folder: Path) -> tuple[tuple[int, int], Folder] | None:
-        """Contents of a folder, and its unique identity."""
+    def _look_into(self, folder: Path) -> Folder | None:
+        """Contents of a folder."""
         listed = self.ask(folder, lambda: _list(folder))
         if listed is None:
             return None
-        number, entries = listed
+        identity, entries = listed
         kinds: dict[str, dict[str, Path]] = {"folder": {}, "file": {}}
         for entry in sorted(entries, key=lambda entry: entry.name):
             # Copies in progress and caches have hidden names.
@@ -168,7 +152,7 @@ class Looker:
             # A link that leads nowhere, of another suffix, was one to neither a log nor a folder.
             elif entry.name.endswith(SUFFIXES) or (kind in _DEAD and not path.suffix):
                 self.skip(path, kind)
-        return number, Folder(folder, kinds["folder"], kinds["file"])
+        return Folder(folder, kinds["folder"], kinds["file"], identity)
 
 
 _DEAD = (_TO_NOTHING, _TO_ITSELF) = ("it is a link to nothing", "it is a link to itself")

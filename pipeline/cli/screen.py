@@ -153,7 +153,7 @@ def format_run(
     """
     verdict = str(summary.get("verdict") or "")
     head, first = _format_head(summary), [verdict] if verdict else []
-    is_excluded = RunReport(summary).is_refused
+    is_excluded = RunReport(summary).refusal
     # If the data are invalid, this is stated first.
     lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
@@ -321,7 +321,7 @@ def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
         lines.append(_row("next", f"slip serve {name}    add the suggested term there"))
     elif stored.get("effects"):
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
-    elif RunReport(summary).is_refused:
+    elif RunReport(summary).refusal:
         log = _relative(str(mapping_in(summary, "log").get("path") or "LOG"))
         lines.append(_row("next", f"slip inspect {shlex.quote(log)}"))
     if stored.get("undecided"):

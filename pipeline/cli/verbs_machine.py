@@ -66,7 +66,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         require_package(package, "serve", "the workbench")
     from pipeline.models import load_effects  # noqa: PLC0415 - heavy
     from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
-    from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
+    from pipeline.web import LOOPBACK, Limits  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 
     load_effects(effects or ())
@@ -81,7 +81,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         if open_browser:
             _open_browser(whole)
 
-    if not is_loopback(host):
+    if host not in LOOPBACK:
         print_note(
             f"slip: {host} can be reached from the network: whoever has the token, or reads it on its way, "
             "can read these results and change models. Leave --host out to serve this machine only."

@@ -76,10 +76,8 @@ def query(  # noqa: D417 - arguments document themselves
         to: how to print the answer.
         as_json: print one JSON object: columns and rows.
     """
-    from pipeline.store import Partition  # noqa: PLC0415 - heavy
-
-    partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
-    answer = open_results(results).query(sql, partition)
+    asked = {"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day}
+    answer = open_results(results).query(sql, asked)
     if as_json or to == "json":
         _print_json(answer)
     elif to == "csv":

@@ -19,7 +19,7 @@ from pipeline.estimation.stored_diagnosis import DIAGNOSED
 from pipeline.results import find_refusal, read_findings
 from pipeline.run import GROUND_UNOBSERVABLE
 from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
-from pipeline.store import DIAGNOSIS, Manifest, Store, StoreError, date_runs, scan_table
+from pipeline.store import DIAGNOSIS, Manifest, Store, StoreError, date_runs
 from schemas import contract_of
 
 _DATES = ("day", "month", "year")
@@ -64,7 +64,7 @@ class ComparedRuns:
 
     def scan(self, table: str) -> pl.LazyFrame:
         """Rows of a table of these runs."""
-        rows = scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
+        rows = self.store.scan(table, list(self.manifests.values()))
         return rows.filter(pl.col("run").is_in(list(self.manifests)))
 
     def read_estimates(self) -> pl.DataFrame:
@@ -240,7 +240,7 @@ def _find_slippery(compared: ComparedRuns) -> list[str]:
         if sheets[run] in asked and run not in claimed and not manifest.find_damage(["slip"])
     ]
     driven = (
-        scan_table("slip", root=compared.store.root, manifests=siblings)
+        compared.store.scan("slip", siblings)
         .select("run", "input", "suspect", "f_x", "v_x", "transitory")
         .collect()
     )

@@ -1,4 +1,4 @@
-"""Dependence of residuals: the signature of each effect, autocorrelation, correlation with the input."""
+"""The signature of each effect: how residuals depend on the variable that it acts on."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,6 @@ from pipeline.estimation.model_state import ModelState
 from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.estimation.window_residuals import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.models import Place, Timing
-from pipeline.run import SPAN_S
 
 # The signature of an effect: the residual against the variable that it acts on, with the effect's curve.
 #
@@ -322,97 +321,3 @@ def _find_one(
         after=bins.regress(rest),
         after_error=bins.find_error(rest, block),
     )
-
-
-# Residual analysis of system identification: autocorrelation and cross-correlation with the input.
-#
-# Residuals of a complete model are white and uncorrelated with its input (Ljung, System Identification,
-# section 16.6). Overlapping windows share data, so only lags of whole windows are used.
-
-LONGEST_S = 5.0
-"""Largest lag of the autocorrelation [s]."""
-FEWEST = 40
-"""Fewest windows for an autocorrelation."""
-
-
-def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
-    """Autocorrelation over lags up to `LONGEST_S`.
-
-    Args:
-        times: middles of the windows [s], increasing, shape (n,).
-        residual: at the windows, shape (n,); pairs across a gap are excluded.
-
-    Returns:
-        Lags [s] and correlations, shape (k,) each, the first at lag zero, and the 95 % bound for white noise.
-    """
-    values = _standardise(residual)
-    lags, correlations = _correlate(times, values, values, range(_longest(times) + 1))
-    return lags, correlations, NORMAL_95 / np.sqrt(_count_apart(times))
-
-
-def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
-    """Cross-correlation of a residual with the input; at a positive lag the input is earlier.
-
-    Args:
-        times: middles of the windows [s], increasing, shape (n,).
-        signal: the input at the windows, shape (n,).
-        residual: at the windows, shape (n,).
-
-    Returns:
-        Lags [s] from `-LONGEST_S` to `LONGEST_S` and correlations, shape (k,) each, and the 95 % bound for
-        residuals that have this autocorrelation and are independent of the input (Bartlett).
-    """
-    given, values = _standardise(signal, clip=False), _standardise(residual)
-    longest = _longest(times)
-    lags, correlations = _correlate(times, given, values, range(-longest, longest + 1))
-    own = [_correlate(times, one, one, range(longest + 1))[1] for one in (given, values)]
-    size = min(one.size for one in own)
-    repeated = 1.0 + 2.0 * float(np.sum(own[0][1:size] * own[1][1:size])) if size else 1.0
-    return lags, correlations, float(NORMAL_95 * np.sqrt(max(repeated, 1.0) / _count_apart(times)))
-
-
-def _standardise(values: Floats, *, clip: bool = True) -> Floats:
-    """Values centred and scaled to mean square one; outliers clipped at six robust standard deviations."""
-    centred = values - (np.median(values) if clip else values.mean())
-    if clip:
-        limit = CLIP * robust_spread(centred) + 1e-12
-        centred = np.clip(centred, -limit, limit)
-    scaled: Floats = centred / np.sqrt(float(np.mean(centred**2)) + 1e-24)
-    return scaled
-
-
-def _stride(times: Floats) -> int:
-    """Number of windows from one to the next non-overlapping one."""
-    return max(round(SPAN_S / float(np.median(np.diff(times)))), 1)
-
-
-def _longest(times: Floats) -> int:
-    return int(LONGEST_S / float(np.median(np.diff(times)))) // _stride(times)
-
-
-def _count_apart(times: Floats) -> float:
-    return times.size / _stride(times)
-
-
-def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]) -> tuple[Floats, Floats]:
-    """Lags [s] and correlations of windows that many strides apart, for lags with enough pairs.
-
-    Each is scaled by the mean squares of its own pairs: those of the whole series may be smaller, and the
-    correlation larger than one.
-    """
-    stride, step = _stride(times), float(np.median(np.diff(times)))
-    rows = []
-    for lag in lags:
-        shift = abs(lag) * stride
-        if shift >= times.size:
-            continue
-        early, late = slice(None, times.size - shift), slice(shift, None)
-        if lag < 0:
-            early, late = late, early
-        together = np.abs(np.abs(times[late] - times[early]) - shift * step) < 0.5 * step
-        if int(together.sum()) >= FEWEST // 2:
-            pair = before[early][together], after[late][together]
-            size = np.sqrt(float(np.mean(pair[0] ** 2)) * float(np.mean(pair[1] ** 2))) + _NOTHING
-            rows.append((lag * stride * step, float(np.mean(pair[0] * pair[1])) / size))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 2)
-    return table[:, 0], table[:, 1]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-import io
+import json
 import math
 import operator
 import pkgutil
@@ -15,13 +15,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
-
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.nodes import ScalarNode
-from ruamel.yaml.representer import RoundTripRepresenter
-from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+from typing import Any, TypeAlias
 
 from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
 from pipeline.models import Effect, FormulaEffect, Model, ModelFile, Parameter, Quantity, is_own
@@ -176,7 +170,22 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
         raise MotionError("no_gate", what, where="--gate", hint=hint)
     if target.write_file is not None:
         return target.write_file(file)
-    facts, table = start_table(file, target)
+    facts = Facts(file)
+    if facts.vehicle.kind not in target.kinds:
+        raise MotionError(
+            "wrong_vehicle",
+            f"{name} has parameters for {' and '.join(target.kinds)} vehicles; {facts.vehicle.id} is "
+            f"{facts.vehicle.kind}",
+            where=facts.vehicle.id,
+            hint="Export to another target: json and python take every vehicle.",
+        )
+    head = [
+        f"{quote_name(facts.vehicle.name)}: {target.about}.",
+        f"Names: {target.source}.",
+        facts.format_fit(),
+        facts.vehicle.format_unknown(),
+    ]
+    table = ParameterTable([line for line in head if line])
     for row in target.rows:
         if not row.kinds or facts.vehicle.kind in row.kinds:
             _fill_row(row, facts, table, used)
@@ -227,19 +236,6 @@ _MOST_GROUNDS = 5
 """Values by ground that a comment lists; of more it has the least and the largest."""
 _LEAST_FACTOR = 0.01
 """Least ratio of an effective to a nominal length: below it a vehicle hardly moves, and has no parameters."""
-
-
-def require_factors(model: Model) -> None:
-    """Refuse effective lengths of almost zero, by which controllers divide.
-
-    Raises:
-        MotionError: ``absurd_number``.
-    """
-    for effect in model:
-        for parameter in effect.parameters:
-            if _FACTORS.intersection(parameter.quantities):
-                value = effect.values[parameter.name]
-                require_plausible(f"{effect.id}.{parameter.name}", value, least=_LEAST_FACTOR)
 
 
 def _check_numbers(file: ModelFile, current: Current) -> None:
@@ -364,9 +360,13 @@ class Facts:
     """
 
     def __init__(self, file: ModelFile) -> None:
-        require_factors(file.model)
         self.file = file
         self.vehicle = file.model.vehicle
+        for effect, parameter in self._list_numbers():
+            # Controllers divide by effective lengths.
+            if _FACTORS.intersection(parameter.quantities):
+                value = effect.values[parameter.name]
+                require_plausible(f"{effect.id}.{parameter.name}", value, least=_LEAST_FACTOR)
 
     def take(self, quantity: Quantity) -> Amount:
         """Return a quantity; neutral and without sources if no effect of the model has it.
@@ -473,11 +473,9 @@ class Facts:
 
     def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
         """Limit of the body, at most the largest driven value: wheels that turn faster may slip."""
-        rows = self.file.list_fitted("runs")
-        driven = [value for row in rows if isinstance(value := row.get(key), float)]
-        if not (limit.is_known and driven) or limit.value <= max(driven):
+        most = max(self.list_driven(key), default=math.inf)
+        if not limit.is_known or limit.value <= most:
             return limit
-        most = max(driven)
         source = f"no more than was driven: {most:.3g} {unit} (99th percentile)"
         return Amount(most, (*limit.sources, source), limit.effects)
 
@@ -512,9 +510,10 @@ class Facts:
                 lines.append("; ".join(missing) or effect.id)
         return lines
 
-    def list_sources(self, effect: Effect) -> list[str]:
-        """A line for each parameter of an effect that is in use."""
-        return [self._format_source(effect, one) for one in effect.parameters if effect.is_used(one)]
+    def list_driven(self, key: str) -> list[float]:
+        """A number of every run of the fit that has it, for example `DRIVEN_SPEED`."""
+        rows = self.file.list_fitted("runs")
+        return [value for row in rows if isinstance(value := row.get(key), float)]
 
     def format_fit(self) -> str:
         """Data that the model was fitted to; empty before a fit."""
@@ -578,30 +577,6 @@ def name_entity(vehicle: Vehicle) -> str:
     return re.sub(r"\W+", "_", vehicle.id) or "robot"
 
 
-def start_table(file: ModelFile, target: Target) -> tuple[Facts, ParameterTable]:
-    """Facts of a model, and a table with a head that gives vehicle, target and fit.
-
-    Raises:
-        MotionError: ``wrong_vehicle``, the target has no parameters for this kind of vehicle.
-    """
-    facts = Facts(file)
-    if facts.vehicle.kind not in target.kinds:
-        raise MotionError(
-            "wrong_vehicle",
-            f"{target.name} has parameters for {' and '.join(target.kinds)} vehicles; {facts.vehicle.id} is "
-            f"{facts.vehicle.kind}",
-            where=facts.vehicle.id,
-            hint="Export to another target: json and python take every vehicle.",
-        )
-    head = [
-        f"{quote_name(facts.vehicle.name)}: {target.about}.",
-        f"Names: {target.source}.",
-        facts.format_fit(),
-        facts.vehicle.format_unknown(),
-    ]
-    return facts, ParameterTable([line for line in head if line])
-
-
 def _join(quantity: Quantity, values: list[float]) -> float:
     if values or quantity.join not in {min, max}:
         return float(quantity.join(values))
@@ -622,9 +597,6 @@ def _take_least(*amounts: Amount) -> Amount:
     return combine(min, *known) if len(known) > 1 else (known or [Amount(math.inf)])[0]
 
 
-_INDENT = 2
-
-
 def list_comments(facts: Facts, table: ParameterTable) -> list[str]:
     """Comment lines above the parameters: the head, and the effects that none of them covers."""
     unmapped = facts.list_unmapped(table)
@@ -634,39 +606,30 @@ def list_comments(facts: Facts, table: ParameterTable) -> list[str]:
 
 def write_yaml(facts: Facts, table: ParameterTable) -> str:
     """Format a table as a ROS 2 parameter file."""
-    tree = CommentedMap()
+    tree: dict[str, Any] = {}
     for setting in table.settings:
         group = tree
         *above, name = setting.path.split(".")
         for node in above:
-            group = group.setdefault(node, CommentedMap())
-        group[name] = _make_value(setting.value)
-        comment = "\n".join(make_plain(line) for line in setting.sources)
-        group.yaml_set_comment_before_after_key(name, before=comment, indent=_INDENT * len(above))
-    comments = "".join(f"# {line}\n" for line in list_comments(facts, table))
-    if not tree:
-        return comments
-    yaml, text = YAML(), io.StringIO()
-    yaml.width = 4096
-    yaml.representer.add_representer(float, _represent_float)
-    yaml.dump(tree, text)
-    return comments + text.getvalue()
+            group = group.setdefault(node, {})
+        group[name] = setting
+    comments = [f"# {line}" for line in list_comments(facts, table)]
+    return "".join(f"{line}\n" for line in [*comments, *_list_lines(tree)])
 
 
-def _make_value(value: object) -> object:
-    if isinstance(value, str):
-        # `off` without quotes is a boolean to the parser of ROS 2.
-        return DoubleQuotedScalarString(value)
-    if not isinstance(value, tuple):
-        return value
-    row = CommentedSeq(value)
-    row.fa.set_flow_style()
-    return row
+def _list_lines(group: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    for name, item in group.items():
+        if isinstance(item, Setting):
+            yield from (f"{indent}# {make_plain(line)}" for line in item.sources)
+            yield f"{indent}{name}: {_write_value(item.value)}"
+        else:
+            yield f"{indent}{name}:"
+            yield from _list_lines(item, f"{indent}  ")
 
 
-def _represent_float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
-    """Write a number with a point, so that every YAML reader takes it for a double."""
-    text = repr(value)
-    if "." not in text:
-        text = text.replace("e", ".0e")
-    return representer.represent_scalar("tag:yaml.org,2002:float", text)
+def _write_value(value: object) -> str:
+    """A value that every YAML reader takes for its type: a number with a point, a word in quotes."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_write_value, value))}]"
+    text = json.dumps(value)
+    return text.replace("e", ".0e") if isinstance(value, float) and "." not in text else text

@@ -178,14 +178,10 @@ def _add_offset(facts: Facts, table: ParameterTable, gate: str) -> None:
 
 def _find_condition(facts: Facts) -> tuple[str, Amount, Amount]:
     """How the runs of the fit were driven: in words, lower speed [m/s] and largest yaw rate [rad/s]."""
-    rows = facts.file.list_fitted("runs")
-    slow, fast, turn = (
-        [value for row in rows if isinstance(value := row.get(key), float)]
-        for key in (LOWER_SPEED, DRIVEN_SPEED, DRIVEN_TURN)
-    )
+    slow, fast, turn = map(facts.list_driven, (LOWER_SPEED, DRIVEN_SPEED, DRIVEN_TURN))
     if not (slow and fast and turn):
         return "", Amount(math.nan), Amount(math.nan)
-    grounds = dict.fromkeys(str(row.get("terrain")) for row in rows)
+    grounds = dict.fromkeys(str(row.get("terrain")) for row in facts.file.list_fitted("runs"))
     where = " and ".join(quote_name(name) for name in grounds if name not in {"unknown", "None"})
     words = f", learned mostly at {min(slow):.3g} to {max(fast):.3g} m/s, up to {max(turn):.3g} rad/s"
     least, most = (Amount(value, ("driven in the runs of the fit",)) for value in (min(slow), max(turn)))

@@ -5,6 +5,7 @@ The fitted model is driven by a constant command until its motion is steady.
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,60 +74,44 @@ def _reset(count: int, signals: int) -> Resets:
     return Resets(np.zeros(count, dtype=np.int64), zero, zero, np.full((1, signals), math.nan))
 
 
-class Response:
+class Response(NamedTuple):
     """Factors of a model: its steady motion over the command, at quarters of the largest driven speed.
 
     Attributes:
         speeds: commanded speeds [m/s], shape (n,).
-        turn: commanded yaw rate at which turning is judged [rad/s].
         linear: speed over its command when driving straight, shape (n,).
         angular: yaw rate over its command at these speeds, shape (n,).
     """
 
-    def __init__(self, facts: Facts, effects: Sequence[Effect] | None = None) -> None:
-        vehicle, known = facts.vehicle, facts.file.model.effects if effects is None else effects
-        driven = facts.file.list_fitted("runs")
-        top, turn = (
-            max(
-                (value for row in driven if isinstance(value := row.get(key), float) and value > 0.0),
-                default=0.0,
-            )
-            for key in (DRIVEN_SPEED, DRIVEN_TURN)
-        )
-        top = top or vehicle.max_speed_mps or _USUAL_TOP[0]
-        self.turn = 0.5 * (turn or _USUAL_TOP[1])
-        self.speeds = np.array([float(f"{top * (n + 1) / _SPEEDS:.3g}") for n in range(_SPEEDS)])
-        straight = [find_steady_motion(vehicle, known, speed, 0.0)[0] for speed in self.speeds.tolist()]
-        curved = [
-            find_steady_motion(vehicle, known, speed, self._limit(vehicle, speed))[1]
-            for speed in self.speeds.tolist()
-        ]
-        self.linear = np.array(straight) / self.speeds
-        self.angular = np.array(curved) / [self._limit(vehicle, speed) for speed in self.speeds.tolist()]
-
-    def _limit(self, vehicle: Vehicle, speed: float) -> float:
-        """Yaw rate at a speed: what the steering reaches at most."""
-        if vehicle.kind != "ackermann":
-            return self.turn
-        steering = 0.5 * (vehicle.max_steering_rad or 0.5)
-        return min(self.turn, speed * math.tan(steering) / (vehicle.wheelbase_m or 1.0))
+    speeds: Floats
+    linear: Floats
+    angular: Floats
 
     @property
     def separation(self) -> Floats:
-        """`wheel_separation_multiplier` at each speed, once the radii are corrected by `linear`."""
-        return _divide(self.linear, self.angular)
+        """`wheel_separation_multiplier` at each speed, once the radii are corrected by `linear`.
+
+        It is infinite where the vehicle does not turn.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio: Floats = self.linear / self.angular
+        return ratio
 
 
-def _divide(values: Floats, by: Floats) -> Floats:
-    """Ratios; infinite where the vehicle stands still or does not turn."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio: Floats = values / by
-    return ratio
+def find_response(facts: Facts) -> Response:
+    """Drive the model at several speeds, straight and in a turn at half of the largest driven yaw rate."""
+    vehicle, effects = facts.vehicle, facts.file.model.effects
+    top, turn = (max(facts.list_driven(key), default=0.0) for key in (DRIVEN_SPEED, DRIVEN_TURN))
+    top, turn = top or vehicle.max_speed_mps or _USUAL_TOP[0], 0.5 * (turn or _USUAL_TOP[1])
+    speeds = [float(f"{top * (n + 1) / _SPEEDS:.3g}") for n in range(_SPEEDS)]
+    straight = [find_steady_motion(vehicle, effects, speed, 0.0)[0] for speed in speeds]
+    curved = [find_steady_motion(vehicle, effects, speed, turn)[1] for speed in speeds]
+    return Response(np.array(speeds), np.array(straight) / speeds, np.array(curved) / turn)
 
 
 def describe_spread(facts: Facts) -> list[str]:
     """Multipliers per speed as lines of a comment, where one for all speeds does not fit; else empty."""
-    response = Response(facts)
+    response = find_response(facts)
     own = facts.vehicle.controller_track_multiplier
     rows = {
         "wheel_separation_multiplier": own * response.separation,

@@ -9,10 +9,9 @@ from typing import Any, Final
 from mcap.records import Channel, Schema
 
 from pipeline.core import format_size, name_first
-from pipeline.logs.chunks import largest_plausible
+from pipeline.logs.chunks import Span, SpanKind, largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
-from pipeline.logs.spans import Span, SpanKind
 
 _MAX_EXTRAS: Final = 64 << 20
 """Maximum size of a file's metadata and names of attachments [bytes]; the largest recorded is a robot
@@ -61,11 +60,10 @@ class Catalog:
     """Contents of a file.
 
     ``container`` is the kind of file, empty for MCAP. ``most_inflated`` is the user's limit of the inflated
-    size of a bag [bytes], counted while it is read, ``bag_chunks`` is the number of its chunks: it has no
-    spans. ``metadata`` and ``attachments`` are in the order of the file, ``side_records`` are their offsets,
-    lengths and names. ``counts`` are messages by channel number. ``covers`` is the evidence for each schema
-    and channel of an MCAP file, ``contradicted`` are those with differing copies, and ``rivals`` are the
-    copies in the summary that lost to copies in the data section.
+    size [bytes]; that of a database, which has no spans, is counted while it is read. ``metadata`` and
+    ``attachments`` are in the order of the file, ``side_records`` are their offsets, lengths and names.
+    ``counts`` are messages by channel number. ``bare`` are the schemas and channels that no checksum covers,
+    ``contradicted`` those with differing copies, ``repeated`` the copies after the data section.
     """
 
     container: str = ""
@@ -78,7 +76,6 @@ class Catalog:
     contradicted: set[tuple[type, int]] = field(default_factory=set)
     repeated: list[Schema | Channel] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
-    bag_chunks: int = 0
     compressions: set[str] = field(default_factory=set)
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     attachments: list[str] = field(default_factory=list)
@@ -94,7 +91,12 @@ class Catalog:
 
     def count_chunks(self) -> int:
         """Number of chunks; 0 of a file that has none."""
-        return self.bag_chunks + sum(span.kind.value != "loose" for span in self.spans)
+        return sum(span.kind.value != "loose" for span in self.spans)
+
+    def add_times(self, first: int, last: int) -> None:
+        """Add the first and last log time [ns] of some messages."""
+        self.start_ns = first if self.start_ns is None else min(first, self.start_ns)
+        self.end_ns = last if self.end_ns is None else max(last, self.end_ns)
 
     def add_description(self, record: Schema | Channel, *, covered: bool) -> None:
         """Add a schema or channel: the first of a number counts, or the first that a checksum covers."""
@@ -170,7 +172,6 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         taken += work if fits else 0
         (within if fits else omitted).append(span)
     catalog.spans = within
-    starts, ends = _list_times(omitted)
     text = (
         f"the chunks of the file decompress to {format_size(total)}, {total / size:.0f} times its size, and "
         f"at most {format_size(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks "
@@ -180,10 +181,9 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         Loss(
             OVER_BUDGET,
             text,
-            bytes=sum(span.length for span in omitted),
-            chunks=len(omitted),
-            start_ns=min(starts, default=None),
-            end_ns=max(ends, default=None),
+            sum(span.length for span in omitted),
+            len(omitted),
+            *_range_of(omitted),
         )
     )
 
@@ -193,10 +193,11 @@ def _work(inflated: int, stored: int) -> int:
     return inflated if inflated <= largest_plausible(stored) else 0
 
 
-def _list_times(spans: Sequence[Span]) -> tuple[list[int], list[int]]:
-    """Known first and last log times of spans [ns]."""
-    starts = [span.start_ns for span in spans if span.start_ns is not None]
-    return starts, [span.end_ns for span in spans if span.end_ns is not None]
+def _range_of(spans: Sequence[Span]) -> tuple[int | None, int | None]:
+    """First and last known log time of spans [ns]."""
+    starts = (span.start_ns for span in spans if span.start_ns is not None)
+    ends = (span.end_ns for span in spans if span.end_ns is not None)
+    return min(starts, default=None), max(ends, default=None)
 
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
@@ -263,13 +264,12 @@ class DataSection:
                 f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
                 "something else is damaged, such as metadata or chunks that were not read"
             )
-        starts, ends = _list_times(self._catalog.spans)
         return Loss(
             "checksum_mismatch",
             text,
-            bytes=self._catalog.data_end or 0,
-            start_ns=min(starts, default=None),
-            end_ns=max(ends, default=None),
+            self._catalog.data_end or 0,
+            0,
+            *_range_of(self._catalog.spans),
         )
 
 

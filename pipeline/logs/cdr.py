@@ -1,4 +1,4 @@
-"""CDR of many messages at once: reading with one cursor for all rows, writing rows of one layout.
+"""Reading CDR of many messages at once, with one cursor for all rows.
 
 All rows are messages of one type. While their layouts agree, the cursor's position is one number and a field
 of all rows is one strided copy; once a length differs between rows, the position is an array and a field is
@@ -8,17 +8,15 @@ row is read beyond its end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import Flags, Ints
-from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.records import Buffer, LogError
-from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
+from pipeline.logs.schema import NUMBER_TYPES, SIZES
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,136 +287,3 @@ class Cursor:
         )
         gathered = window[position].view(dtype).reshape(position.size, count)
         return gathered.astype(dtype.newbyteorder("="), copy=False)
-
-
-# Serializing columns as CDR, rows of the same layout as one block.
-#
-# The rows are grouped by the lengths of their strings and sequences; within a group every field has one
-# offset, and writing it is one strided copy. Little-endian XCDR1, as ROS 2 recorders write.
-
-_ENCAPSULATION: Final = b"\x00\x01\x00\x00"
-
-
-@dataclass(slots=True)
-class RowBuffer:
-    """Rows of one layout being written: blocks of bytes with their offsets after the encapsulation."""
-
-    rows: int
-    position: int = 0
-    written: list[tuple[int, NDArray[np.uint8]]] = field(default_factory=list)
-
-    def put(self, kind: str, values: NDArray[np.generic]) -> None:
-        """Append aligned numbers, the same number to every row."""
-        size = SIZES[kind]
-        self.position = -(-self.position // size) * size
-        stored = np.ascontiguousarray(
-            values.reshape(self.rows, -1), dtype=NUMBER_TYPES[kind].newbyteorder("<")
-        )
-        self.put_bytes(stored.view(np.uint8).reshape(self.rows, -1))
-
-    def put_bytes(self, block: NDArray[np.uint8]) -> None:
-        """Append bytes, shape (rows, length)."""
-        self.written.append((self.position, block))
-        self.position += block.shape[1]
-
-    def put_length(self, length: int) -> None:
-        """Append the length of a string or sequence."""
-        self.put("uint32", np.full((self.rows, 1), length, dtype=np.uint32))
-
-    def fill(self) -> NDArray[np.uint8]:
-        """The payloads as bytes, shape (rows, length)."""
-        head = len(_ENCAPSULATION)
-        block = np.zeros((self.rows, head + self.position), dtype=np.uint8)
-        block[:, :head] = np.frombuffer(_ENCAPSULATION, dtype=np.uint8)
-        for position, part in self.written:
-            block[:, head + position : head + position + part.shape[1]] = part
-        return block
-
-
-@dataclass(slots=True)
-class RowWriter:
-    """Writer of columns into rows of one layout; ``texts`` are their encoded strings."""
-
-    columns: Mapping[str, Column]
-    texts: Mapping[str, list[bytes]]
-    buffer: RowBuffer
-
-    def write(self, structure: Structure, rows: Ints, prefix: str, element: int | None) -> None:
-        """Write one structure of every row; ``element`` is its index in the enclosing sequence."""
-        if not structure.members:
-            self.buffer.put("uint8", np.zeros((rows.size, 1), dtype=np.uint8))
-        for member in structure.members:
-            path = f"{prefix}{member.name}"
-            if isinstance(member.element, Structure):
-                if member.count is None:
-                    self.write(member.element, rows, f"{path}.", element)
-                else:
-                    self._write_structures(member, member.element, rows, path)
-            elif member.element == "string":
-                self._write_texts(member, rows, path, element)
-            else:
-                self._write_numbers(member, member.element, rows, path, element)
-
-    def _write_structures(self, member: Member, below: Structure, rows: Ints, path: str) -> None:
-        count = (
-            member.count if member.count not in (None, SEQUENCE) else self._count_below(f"{path}[].", rows)
-        )
-        if member.count == SEQUENCE:
-            self.buffer.put_length(count or 0)
-        for number in range(count or 0):
-            self.write(below, rows, f"{path}[].", number)
-
-    def _count_below(self, prefix: str, rows: Ints) -> int:
-        for path, column in self.columns.items():
-            if path.startswith(prefix) and isinstance(column, Ragged | RaggedStrings):
-                first = int(rows[0])
-                return int(column.offsets[first + 1] - column.offsets[first])
-        return 0
-
-    def _write_numbers(self, member: Member, kind: str, rows: Ints, path: str, element: int | None) -> None:
-        column = self.columns.get(path)
-        if isinstance(column, Ragged):
-            start = column.offsets[rows]
-            if element is not None:
-                self.buffer.put(kind, column.values[start + element])
-                return
-            count = int(column.offsets[rows[0] + 1] - start[0])
-            self.buffer.put_length(count)
-            if count:
-                self.buffer.put(kind, column.values[start[:, None] + np.arange(count)])
-        elif isinstance(column, np.ndarray):
-            self.buffer.put(kind, column[rows])
-        elif member.count == SEQUENCE:
-            self.buffer.put_length(0)
-        else:
-            width = 1 if member.count is None else member.count
-            self.buffer.put(kind, np.zeros((rows.size, width), dtype=NUMBER_TYPES[kind]))
-
-    def _write_texts(self, member: Member, rows: Ints, path: str, element: int | None) -> None:
-        column = self.columns.get(path)
-        if isinstance(column, RaggedStrings):
-            start = column.offsets[rows]
-            if element is not None:
-                self._write_codes(path, column.codes[start + element])
-                return
-            count = int(column.offsets[rows[0] + 1] - start[0])
-            if member.count == SEQUENCE:
-                self.buffer.put_length(count)
-            for number in range(count):
-                self._write_codes(path, column.codes[start + number])
-        elif isinstance(column, Strings):
-            self._write_codes(path, column.codes[rows])
-        elif member.count == SEQUENCE:
-            self.buffer.put_length(0)
-        else:
-            for _ in range(1 if member.count is None else member.count):
-                self.buffer.put_length(1)
-                self.buffer.put_bytes(np.zeros((rows.size, 1), dtype=np.uint8))
-
-    def _write_codes(self, path: str, codes: NDArray[np.int32]) -> None:
-        present, position = np.unique(codes, return_inverse=True)
-        texts = [self.texts[path][code] for code in present.tolist()]
-        length = len(texts[0])
-        table = np.frombuffer(b"".join(texts), dtype=np.uint8).reshape(len(texts), length)
-        self.buffer.put_length(length)
-        self.buffer.put_bytes(table[position.reshape(-1)])

@@ -28,7 +28,7 @@ from pipeline.logs.columns import (
     join_blocks,
     select_leaves,
 )
-from pipeline.logs.decode import ColumnParts, Decoder, plan_fields, wanted_leaves
+from pipeline.logs.decode import Decoder, Piece, join_pieces, plan_fields, wanted_leaves
 from pipeline.logs.index import ChannelInfo
 from pipeline.logs.records import LogError, unsupported
 from pipeline.logs.schema import (
@@ -71,17 +71,15 @@ class StructuredDecoder:
         structure: the type.
         paths: wanted leaf fields.
         encoding: ``"cdr"`` or ``"ros1"``.
-        expected: number of messages stated in the index.
         exact: whether messages longer than the type are rejected, for a type that is not from the log.
     """
 
-    def __init__(
-        self, structure: Structure, paths: set[str], encoding: str, expected: int, *, exact: bool = False
-    ) -> None:
+    def __init__(self, structure: Structure, paths: set[str], encoding: str, *, exact: bool = False) -> None:
         self._plan = plan_fields(structure, paths)
         self._ros1 = encoding == "ros1"
         self._decoder = Decoder(self._plan, exact)
-        self._parts = {path: ColumnParts(leaf, expected) for path, leaf in wanted_leaves(self._plan)}
+        self._leaves = dict(wanted_leaves(self._plan))
+        self._pieces: dict[str, list[Piece]] = {path: [] for path in self._leaves}
         self._ids: list[Ints] = []
         self.rejected: list[Rejected] = []
 
@@ -125,7 +123,7 @@ class StructuredDecoder:
         pieces, whole = self._decoder.decode(Cursor(block.data, base, limit, chosen, dialect))
         self._ids.append(ids[whole])
         for path, piece in pieces.items():
-            self._parts[path].add(piece)
+            self._pieces[path].append(piece)
         if whole.size < chosen.size:
             missing = np.ones(ids.size, dtype=np.bool_)
             missing[whole] = False
@@ -142,7 +140,10 @@ class StructuredDecoder:
         row_of[ids] = np.arange(ids.size)
         order = row_of[rows]
         vocabularies = self._decoder.vocabularies
-        return {path: part.take_column(order, vocabularies.get(path)) for path, part in self._parts.items()}
+        return {
+            path: join_pieces(leaf, self._pieces.pop(path), order, vocabularies.get(path))
+            for path, leaf in self._leaves.items()
+        }
 
 
 @dataclass(slots=True)
@@ -502,7 +503,6 @@ def decoder_for(
             structure,
             chosen,
             info.message_encoding,
-            info.message_count,
             exact=bool(notes and structure.members),
         ),
         leaves,

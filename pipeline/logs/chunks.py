@@ -4,7 +4,7 @@ import bz2
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
+from enum import Enum
 from typing import IO, Final
 
 import numpy as np
@@ -12,14 +12,13 @@ import zstandard
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, format_size
+from pipeline.core import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30
 """Maximum inflated size of a chunk [bytes]; recorders write 1 to 100 MB."""
 
-_COMPRESSIONS: Final = ("", "zstd", "lz4")
 _PLAUSIBLE: Final = 256 << 20
 _PLAUSIBLE_RATIO: Final = 1000
 """Maximum inflation ratio of a chunk larger than `_PLAUSIBLE` bytes; only malicious files exceed it."""
@@ -48,21 +47,17 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
 
     Args:
         stored: compressed bytes.
-        compression: ``""``, ``"zstd"`` or ``"lz4"``.
+        compression: ``""``, ``"zstd"``, ``"lz4"``, or ``"bz2"`` of bags.
         size: expected inflated size [bytes].
 
     Raises:
         InflateError: the inflated size differs, the bytes are damaged, or the size is implausible.
     """
     check_size(len(stored), compression, size)
-    if compression == "":
-        inflated: Buffer = stored
-    elif size == 0:
-        inflated = b""
-    elif compression == "zstd":
-        inflated = _inflate_zstd(stored, size)
-    else:
-        inflated = _inflate_lz4(stored, size)
+    inflated = stored if compression == "" else b""
+    if compression and size:
+        with _naming_damage():
+            inflated = _INFLATERS[compression](stored, size)
     if len(inflated) != size:
         raise InflateError(f"{len(inflated)} bytes came out in place of {size}")
     return inflated
@@ -74,7 +69,7 @@ def check_size(stored: int, compression: str, size: int) -> None:
     Raises:
         InflateError: it is not, or the compression is unknown.
     """
-    if compression not in _COMPRESSIONS:
+    if compression not in ("", *_INFLATERS):
         raise InflateError(f"the compression {compression[:20]!r} is not known")
     if size > largest_plausible(stored):
         raise InflateError(f"{stored} bytes say they hold {size}, as no recording does")
@@ -121,18 +116,32 @@ def holds_own_checksum(stored: Buffer, compression: str) -> bool:
 
 
 def _inflate_zstd(stored: Buffer, size: int) -> bytes:
-    with _naming_damage():
-        said = zstandard.frame_content_size(stored)
-        if said not in (-1, size):
-            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    said = zstandard.frame_content_size(stored)
+    if said not in (-1, size):
+        raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
+    return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+
+
+def _inflate_bz2(stored: Buffer, size: int) -> bytes:
+    decompressor = bz2.BZ2Decompressor()
+    # One more byte than there should be tells content that is longer.
+    inflated = decompressor.decompress(stored, max_length=size + 1)
+    if not decompressor.eof and len(inflated) <= size:
+        raise InflateError("its end is missing")
+    return inflated
 
 
 def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
 
-    with _naming_damage():
-        return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
+    return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
+
+
+_INFLATERS: Final[dict[str, Callable[[Buffer, int], Buffer]]] = {
+    "zstd": _inflate_zstd,
+    "lz4": _inflate_lz4,
+    "bz2": _inflate_bz2,
+}
 
 
 def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO[bytes]]:
@@ -172,6 +181,45 @@ MESSAGE_OVERHEAD: Final = MESSAGE_HEAD.itemsize
 """Size of a message record before its payload [bytes]."""
 
 
+class SpanKind(Enum):
+    """Kind of a span."""
+
+    CHUNK = "chunk"
+    LOOSE = "loose"
+    CUT_CHUNK = "cut chunk"
+    BAG_CHUNK = "chunk of a bag"
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A range of the file that contains messages: a chunk, or message records outside chunks.
+
+    Attributes:
+        kind: kind of the span.
+        offset: offset of its first byte in the file.
+        length: size without its message indexes [bytes]; with them of a bag.
+        index_length: size of the message indexes after it [bytes].
+        start_ns: first log time as stated by the summary or the chunk, None if unknown.
+        end_ns: last log time, None if unknown.
+        channels: numbers of the channels in it, None if unknown.
+        inflated: inflated size of a chunk as stated by the summary or its header [bytes].
+    """
+
+    kind: SpanKind
+    offset: int
+    length: int
+    index_length: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    channels: frozenset[int] | None = None
+    inflated: int = 0
+
+    @property
+    def end(self) -> int:
+        """Offset after it and its message indexes."""
+        return self.offset + self.length + self.index_length
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
     """The messages of a chunk, in the order of their offsets.
@@ -179,7 +227,7 @@ class Messages:
     Attributes:
         start: offset of each payload in the chunk, int64, shape (n,).
         size: size of each payload [bytes], int64.
-        channel: channel number, uint16.
+        channel: channel number, uint16 (int64 of a bag).
         sequence: sequence number assigned by the writer, uint32.
         log_time: [ns], int64.
         publish_time: [ns], int64.
@@ -190,7 +238,7 @@ class Messages:
 
     start: Ints
     size: Ints
-    channel: NDArray[np.uint16]
+    channel: NDArray[np.integer]
     sequence: NDArray[np.uint32]
     log_time: Ints
     publish_time: Ints
@@ -286,17 +334,15 @@ def _agreeing_messages(
 
 def _walk(chunk: Buffer, start: int, end: int, located: _WalkedChunk) -> None:
     """Note the records from ``start`` on; what follows the first bytes that are none is damage."""
-    unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
-    position = start
-    while position < end:
-        opcode, length = unpack(chunk, position) if position + head_size <= end else (0, 0)
-        after = position + head_size + length
-        if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
+    after = start
+    for opcode, position, following in rec.split_records(chunk, start, end):
+        if opcode == rec.MESSAGE:
             located.offsets.append(position)
-        elif after > end or not _take_side_record(opcode, chunk[position + head_size : after], located):
-            located.damage.append((position, end))
-            return
-        position = after
+        elif not _take_side_record(opcode, chunk[position + rec.HEAD_SIZE : following], located):
+            break
+        after = following
+    if after < end:
+        located.damage.append((after, end))
 
 
 def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
@@ -315,51 +361,3 @@ def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
     located.descriptions.append(record)
     located.known.add(content)
     return True
-
-
-@cache
-def list_decompressors() -> dict[str, Callable[[], bz2.BZ2Decompressor]]:
-    """Factories of decompressors by the name of the compression."""
-    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
-
-    return {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-
-
-class BudgetError(Exception):
-    """The inflated size exceeds the limit of the file."""
-
-
-@dataclass(slots=True)
-class Allowance:
-    """Remaining bytes that a bag may yield, out of ``most``: those of its chunks, or of its messages."""
-
-    most: int
-    remaining: int
-
-    def take(self, size: int) -> None:
-        """Charge bytes that were produced.
-
-        Raises:
-            BudgetError: they exceed the limit.
-        """
-        self.remaining -= size
-        if self.remaining < 0:
-            raise BudgetError(
-                f"its content is more than {format_size(self.most)}, and no more is read; "
-                "a larger --max-inflated reads more"
-            )
-
-    def inflate_chunk(self, name: str, stored: bytes) -> bytes:
-        """Inflate a chunk with the given compression, up to a plausible size.
-
-        Raises:
-            InflateError: it is cut, or larger.
-            BudgetError: it exceeds the limit.
-        """
-        decompressor = list_decompressors()[name]()
-        most = min(largest_plausible(len(stored)), self.remaining + 1)
-        inflated: bytes = decompressor.decompress(stored, max_length=most)
-        self.take(len(inflated))
-        if not decompressor.eof:
-            raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
-        return inflated

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Generic
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import Ints
 from pipeline.logs.cdr import Cursor, Dialect, MisfitError, Vocabulary
-from pipeline.logs.columns import Column, Ragged, RaggedStrings, Scalar, Strings
+from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
 
 # Decoding of rows of serialized messages to pieces of columns.
@@ -352,78 +352,26 @@ def _sum_groups(values: Ints, sizes: Ints) -> Ints:
     return total
 
 
-_FIRST_CAPACITY: Final = 64 << 20
-"""Maximum memory allocated for a column from the message count in the index [bytes]."""
-
-
-class ColumnParts:
-    """The values of one field, in the order in which they are decoded.
+def join_pieces(leaf: Leaf, pieces: Sequence[Piece], order: Ints, vocabulary: Vocabulary | None) -> Column:
+    """Column of some rows.
 
     Args:
         leaf: the field.
-        expected: number of rows stated in the index.
+        pieces: its values, in the order in which they were decoded.
+        order: indices of the rows among those of the pieces.
+        vocabulary: vocabulary of a string field, else None.
     """
-
-    def __init__(self, leaf: Leaf, expected: int) -> None:
-        self._leaf = leaf
-        self._expected = expected
-        self._values = _Growing(leaf.nothing)
-        self._counts = _Growing(np.empty(0, dtype=np.int64))
-
-    def add(self, piece: Piece) -> None:
-        """Append a copy of the values of the next rows."""
-        rows = piece.values.shape[0] if piece.counts is None else piece.counts.size
-        share = self._expected / max(rows, 1)
-        self._values.append(piece.values, share)
-        if piece.counts is not None:
-            self._counts.append(piece.counts, share)
-
-    def take_column(self, order: Ints, vocabulary: Vocabulary | None) -> Column:
-        """Column of some rows; may be called once, because it frees the values.
-
-        Args:
-            order: indices of the rows among those that were added.
-            vocabulary: vocabulary of a string field, else None.
-        """
-        values, count = self._values.give_up(), self._counts.give_up()
-        texts = () if vocabulary is None else vocabulary.texts()
-        if not self._leaf.ragged:
-            values = values if _is_plain(order, values.shape[0]) else values[order]
-            return Strings(values.astype(np.int32, copy=False), texts) if self._leaf.text else values
-        values, offsets = take_rows(values, count, order)
-        if self._leaf.text:
-            return RaggedStrings(values.astype(np.int32, copy=False), texts, offsets)
-        return Ragged(values, offsets)
+    values: NDArray[Any] = np.concatenate([leaf.nothing, *(piece.values for piece in pieces)])
+    texts = () if vocabulary is None else vocabulary.texts()
+    if not leaf.ragged:
+        values = values if _is_plain(order, values.shape[0]) else values[order]
+        return Strings(values, texts) if leaf.text else values
+    counts = [piece.counts for piece in pieces if piece.counts is not None]
+    values, offsets = take_rows(values, np.concatenate([np.empty(0, dtype=np.int64), *counts]), order)
+    return RaggedStrings(values, texts, offsets) if leaf.text else Ragged(values, offsets)
 
 
-class _Growing(Generic[Scalar]):
-    """A growing array; counts read from a file do not determine its memory beyond `_FIRST_CAPACITY`."""
-
-    def __init__(self, nothing: NDArray[Scalar]) -> None:
-        self._nothing = nothing
-        self._data = nothing
-        self._size = 0
-
-    def append(self, values: NDArray[Scalar], share: float) -> None:
-        """Append values; about ``share`` times as many are expected in total."""
-        need = self._size + values.shape[0]
-        if need > self._data.shape[0]:
-            row = max(1, self._nothing.dtype.itemsize * int(np.prod(self._nothing.shape[1:])))
-            expected = int(min(values.shape[0] * share, _FIRST_CAPACITY // row))
-            capacity = max(need, expected, 2 * self._data.shape[0] if self._size else 0)
-            grown = np.empty((capacity, *self._nothing.shape[1:]), dtype=self._nothing.dtype)
-            grown[: self._size] = self._data[: self._size]
-            self._data = grown
-        self._data[self._size : need] = values
-        self._size = need
-
-    def give_up(self) -> NDArray[Scalar]:
-        """Return all values and free the array."""
-        values, self._data, self._size = self._data[: self._size], self._nothing, 0
-        return values
-
-
-def take_rows(values: NDArray[np.generic], counts: Ints, order: Ints) -> tuple[NDArray[np.generic], Ints]:
+def take_rows(values: NDArray[Any], counts: Ints, order: Ints) -> tuple[NDArray[Any], Ints]:
     """Values of ragged rows, reordered by row, and their offsets."""
     if not _is_plain(order, counts.size):
         values = take_ragged(values, counts, order)

@@ -8,13 +8,14 @@ import os
 import stat
 import struct
 import zlib
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
@@ -23,6 +24,7 @@ from pipeline.core import guess_names
 from pipeline.logs import records as rec
 from pipeline.logs.bags import catalog_bag
 from pipeline.logs.catalog import Catalog, keep_within
+from pipeline.logs.chunks import Span, SpanKind
 from pipeline.logs.compressed import COMPRESSED, open_inflated
 from pipeline.logs.records import (
     LONGEST_HEAD,
@@ -35,7 +37,7 @@ from pipeline.logs.records import (
 )
 from pipeline.logs.remote import RemotePath, RemoteSource
 from pipeline.logs.scan import Numbered, Scanner, find_missing
-from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
+from pipeline.logs.spans import Loaded, load_spans
 
 _HASH_BLOCK: Final = 1 << 20
 _MOST_NEIGHBOURS: Final = 1000
@@ -177,6 +179,7 @@ class _DamagedSummaryError(_NoSummaryError):
 class _Summary(NamedTuple):
     start: int
     statistics: Statistics
+    chunks: list[Span]
     side_records: set[tuple[int, int, str]]
 
 
@@ -194,40 +197,45 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
     head = source.read_at(0, LONGEST_MAGIC)
     is_mcap = head.startswith(rec.MAGIC)
     if not is_mcap and (container := detect_container(head)):
-        return catalog_bag(source, container, max_inflated)
+        catalog = catalog_bag(source, container)
+        catalog.most_inflated = max_inflated
+        keep_within(catalog, source.size, max_inflated)
+        return catalog
     catalog = Catalog()
-    start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
+    _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
     stop = source.size - len(rec.MAGIC) if ends_well and source.size >= 2 * len(rec.MAGIC) else source.size
+    summary: _Summary | None = None
+    reason = _NoSummaryError()
     try:
         summary = _read_summary(source, catalog, threads)
-    except _NoSummaryError as reason:
-        damaged = catalog.losses
-        catalog = Catalog(losses=list(damaged))
-        Scanner(source, catalog).scan(start, stop)
-        keep_within(catalog, source.size, max_inflated)
+        stop = summary.start
+    except _NoSummaryError as error:
+        reason, catalog = error, Catalog(losses=catalog.losses)
+    listed = summary.chunks if summary is not None else []
+    Scanner(source, catalog).scan(len(rec.MAGIC), stop, listed)
+    unlisted = catalog.count_chunks() - len(listed)
+    keep_within(catalog, source.size, max_inflated)
+    if summary is None or unlisted:
         examine_spans(source, catalog, threads)
+    if summary is None:
         catalog.notes.append(f"{reason}; the index was rebuilt by reading all records")
-        if isinstance(reason, _DamagedSummaryError) and all(
-            each.kind != "truncated" for each in catalog.losses
-        ):
+        has_loss = any(each.kind == "truncated" for each in catalog.losses)
+        if isinstance(reason, _DamagedSummaryError) and not has_loss:
             text = f"{reason}; all records were read instead"
             catalog.losses.append(Loss("damaged_summary", text))
     else:
-        unlisted = _scan_gaps(source, catalog, start, summary.start)
-        keep_within(catalog, source.size, max_inflated)
         for _, _, name in sorted(summary.side_records - catalog.side_records):
             text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
             catalog.losses.append(Loss("contradiction", text))
-        statistics = summary.statistics
         if unlisted:
             catalog.notes.append(f"{unlisted} chunks that the summary does not list were found")
-            examine_spans(source, catalog, threads)
         else:
+            statistics = summary.statistics
             catalog.counts = dict(statistics.channel_message_counts)
-        if statistics.message_count and not unlisted:
-            catalog.start_ns = rec.clip_time(statistics.message_start_time)
-            catalog.end_ns = rec.clip_time(statistics.message_end_time)
+            if statistics.message_count:
+                times = statistics.message_start_time, statistics.message_end_time
+                catalog.add_times(*map(rec.clip_time, times))
     catalog.losses += [*catalog.find_contradictions(), *catalog.extras.find_losses()]
     return catalog
 
@@ -259,63 +267,127 @@ _FARM_NG: Final = b"\x0a\x08protobuf"
 """Start of the address in the first event, after its length."""
 
 
-def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
+def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> None:
     if head == rec.MAGIC:
-        return len(rec.MAGIC)
-    alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
-    what = hint = ""
+        return
+    what = "this is not an MCAP file or a ROS bag"
+    hint = "Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)"
     if head.startswith(b"\x89MCAP0\n"):
         what = "a copy in text mode changed line ends of the file, and with them its data"
         hint = "Copy the file again in binary mode"
-    elif alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
+    elif sum(map(int.__eq__, head, rec.MAGIC)) >= len(rec.MAGIC) - 2:
+        catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
+        return
+    elif _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
         what = "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file"
         hint = "Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer"
-    elif alike < len(rec.MAGIC) - 2:
-        what = "this is not an MCAP file or a ROS bag"
-        hint = "Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)"
-    if what:
-        raise LogError("not_mcap", what, where=source.name, hint=hint)
-    catalog.losses.append(Loss("damaged_record", "the file's first 8 bytes are damaged", bytes=8))
-    return len(rec.MAGIC)
+    raise LogError("not_mcap", what, where=source.name, hint=hint)
 
 
-def _read_summary(source: ByteSource, catalog: Catalog, threads: int) -> _Summary:
+def _find_summary(source: ByteSource) -> tuple[int, bytes, bool]:
+    """Offset and bytes of the summary, and whether a checksum covers it.
+
+    Raises:
+        _NoSummaryError: there is none, or it is damaged.
+    """
     tail_size = rec.FOOTER_SIZE + len(rec.MAGIC)
-    tail = source.read_at(max(0, source.size - tail_size), tail_size)
-    if len(tail) < rec.FOOTER_SIZE + len(rec.MAGIC) or not tail.endswith(rec.MAGIC):
+    footer_at = source.size - tail_size
+    tail = source.read_at(max(0, footer_at), tail_size)
+    if len(tail) < tail_size or not tail.endswith(rec.MAGIC):
         raise _DamagedSummaryError("the end of the file is not that of an MCAP file")
-    opcode, length = rec.HEAD.unpack_from(tail, 0)
-    if opcode != rec.FOOTER or length != rec.LEAST_BODY[rec.FOOTER]:
-        raise _DamagedSummaryError("the footer is damaged")
     start, _offsets, crc = _FOOTER.unpack_from(tail, rec.HEAD_SIZE)
-    footer_at = source.size - rec.FOOTER_SIZE - len(rec.MAGIC)
-    if start == 0:
+    is_footer = tail.startswith(rec.HEAD.pack(rec.FOOTER, rec.LEAST_BODY[rec.FOOTER]))
+    if is_footer and start == 0:
         raise _NoSummaryError("there is no summary")
-    if not len(rec.MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY:
+    if not is_footer or not len(rec.MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY:
         raise _DamagedSummaryError("the footer is damaged")
     body = source.read_at(start, footer_at - start)
     if crc and zlib.crc32(body + tail[: rec.HEAD_SIZE + 16]) != crc:
         raise _DamagedSummaryError("the summary is damaged")
+    return start, body, crc != 0
+
+
+def _read_summary(source: ByteSource, catalog: Catalog, threads: int) -> _Summary:
+    """Read the summary; its schemas and channels become those of the catalog.
+
+    Raises:
+        _NoSummaryError: there is none that can be used.
+    """
+    start, body, covered = _find_summary(source)
     try:
-        summary = _parse_summary(body, start, catalog, covered=bool(crc))
+        records = _parse_summary(memoryview(body))
     except rec.RecordError as error:
         raise _DamagedSummaryError(f"the summary is damaged ({error})") from None
-    if not crc:
-        _compare_summary(source, catalog, threads)
-    return summary
+    for record in records[Schema] + records[Channel]:
+        catalog.add_description(record, covered=covered)
+    statistics = next(iter(records[Statistics][::-1]), None)
+    if statistics is None:
+        raise _NoSummaryError("the summary has no statistics")
+    chunks = sorted(records[ChunkIndex], key=attrgetter("chunk_start_offset"))
+    counts, channels = statistics.channel_message_counts, catalog.channels
+    schemas = {channel.schema_id for channel in channels.values()}
+    for is_wrong, missing in (
+        (len(chunks) != statistics.chunk_count, "list its chunks"),
+        (sum(counts.values()) != statistics.message_count, "count its messages by channel"),
+        (not counts.keys() <= channels.keys(), "list its channels"),
+        (not schemas <= catalog.schemas.keys() | {0}, "list its schemas"),
+    ):
+        if is_wrong:
+            raise _NoSummaryError(f"the summary does not {missing}")
+    catalog.compressions = {chunk.compression for chunk in chunks}
+    spans = [
+        Span(
+            SpanKind.CHUNK,
+            chunk.chunk_start_offset,
+            chunk.chunk_length,
+            chunk.message_index_length,
+            rec.clip_time(chunk.message_start_time),
+            rec.clip_time(chunk.message_end_time),
+            frozenset(chunk.message_index_offsets) or None,
+            chunk.uncompressed_size,
+        )
+        for chunk in chunks
+    ]
+    ends = [len(rec.MAGIC), *(span.end for span in spans)]
+    least = rec.LEAST_BODY[rec.CHUNK]
+    if any(span.offset < end or span.length < least for span, end in zip(spans, ends, strict=False)):
+        raise _DamagedSummaryError("the summary places its chunks one over the other")
+    if ends[-1] > start:
+        raise _DamagedSummaryError("the summary places chunks beyond the data")
+    if not covered:
+        _compare_summary(source, catalog, spans, threads)
+    side_records = {
+        (one.offset, one.length, one.name) for one in records[AttachmentIndex] + records[MetadataIndex]
+    }
+    return _Summary(start, statistics, spans, side_records)
 
 
-def _compare_summary(source: ByteSource, catalog: Catalog, threads: int) -> None:
+def _parse_summary(body: memoryview) -> defaultdict[type, list[Any]]:
+    """The records of a summary, by kind.
+
+    Raises:
+        RecordError: it is damaged.
+    """
+    records: defaultdict[type, list[Any]] = defaultdict(list)
+    end = 0
+    for opcode, start, end in rec.split_records(body, 0, len(body)):
+        record = rec.parse_record(opcode, body[start + rec.HEAD_SIZE : end])
+        records[type(record)].append(record)
+    if end < len(body):
+        raise rec.RecordError("a record is truncated")
+    return records
+
+
+def _compare_summary(source: ByteSource, catalog: Catalog, spans: Sequence[Span], threads: int) -> None:
     """Compare a summary without a checksum with the chunks that it lists, and those in which channels begin.
 
     Recorders repeat the records of a channel there.
     """
     sought = set(catalog.channels)
     chosen: list[Span] = []
-    for span in catalog.spans:
-        if source.read_at(span.offset, rec.HEAD_SIZE) != rec.HEAD.pack(
-            rec.CHUNK, span.length - rec.HEAD_SIZE
-        ):
+    for span in spans:
+        head = rec.HEAD.pack(rec.CHUNK, span.length - rec.HEAD_SIZE)
+        if source.read_at(span.offset, rec.HEAD_SIZE) != head:
             raise _DamagedSummaryError("the summary disagrees with the chunks")
         if here := sought if span.channels is None else span.channels & sought:
             chosen.append(span)
@@ -324,84 +396,6 @@ def _compare_summary(source: ByteSource, catalog: Catalog, threads: int) -> None
         _add_descriptions(catalog, loaded)
     if catalog.contradicted:
         raise _DamagedSummaryError("the summary disagrees with the chunks")
-
-
-def _parse_summary(body: bytes, start: int, catalog: Catalog, *, covered: bool) -> _Summary:
-    statistics: Statistics | None = None
-    chunks: list[ChunkIndex] = []
-    listed: set[tuple[int, int, str]] = set()
-    position = 0
-    view = memoryview(body)
-    while position < len(view):
-        if position + rec.HEAD_SIZE > len(view):
-            raise rec.RecordError("a record is truncated")
-        opcode, length = rec.HEAD.unpack_from(view, position)
-        position += rec.HEAD_SIZE
-        if length > len(view) - position:
-            raise rec.RecordError("a record is truncated")
-        record = view[position : position + length]
-        position += length
-        parsed = rec.parse_record(opcode, record)
-        if isinstance(parsed, Schema | Channel):
-            catalog.add_description(parsed, covered=covered)
-        elif isinstance(parsed, Statistics):
-            statistics = parsed
-        elif isinstance(parsed, ChunkIndex):
-            chunks.append(parsed)
-        elif isinstance(parsed, AttachmentIndex | MetadataIndex):
-            listed.add((parsed.offset, parsed.length, parsed.name))
-    if statistics is None:
-        raise _NoSummaryError("the summary has no statistics")
-    _check_summary(statistics, chunks, start, catalog)
-    return _Summary(start, statistics, listed)
-
-
-def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int, catalog: Catalog) -> None:
-    if len(chunks) != statistics.chunk_count:
-        raise _NoSummaryError("the summary does not list its chunks")
-    if sum(statistics.channel_message_counts.values()) != statistics.message_count:
-        raise _NoSummaryError("the summary does not count its messages by channel")
-    if any(number not in catalog.channels for number in statistics.channel_message_counts):
-        raise _NoSummaryError("the summary does not list its channels")
-    if any(c.schema_id and c.schema_id not in catalog.schemas for c in catalog.channels.values()):
-        raise _NoSummaryError("the summary does not list its schemas")
-    end = len(rec.MAGIC)
-    for chunk in sorted(chunks, key=attrgetter("chunk_start_offset")):
-        if chunk.chunk_start_offset < end or chunk.chunk_length < rec.LEAST_BODY[rec.CHUNK]:
-            raise _DamagedSummaryError("the summary places its chunks one over the other")
-        end = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
-        catalog.compressions.add(chunk.compression)
-        catalog.spans.append(
-            Span(
-                SpanKind.CHUNK,
-                chunk.chunk_start_offset,
-                chunk.chunk_length,
-                chunk.message_index_length,
-                rec.clip_time(chunk.message_start_time),
-                rec.clip_time(chunk.message_end_time),
-                frozenset(chunk.message_index_offsets) or None,
-                chunk.uncompressed_size,
-            )
-        )
-    if end > start:
-        raise _DamagedSummaryError("the summary places chunks beyond the data")
-
-
-def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> int:
-    """Scan the ranges that no chunk index covers: metadata, attachments, messages outside chunks.
-
-    Returns:
-        Number of chunks in them.
-    """
-    listed, unlisted = list(catalog.spans), list[Span]()
-    ends = [start, *(span.offset + span.length + span.index_length for span in listed)]
-    for position, until in zip(ends, [*(span.offset for span in listed), stop], strict=True):
-        if until > position:
-            catalog.spans = []
-            Scanner(source, catalog).scan(position, until)
-            unlisted += catalog.spans
-    catalog.spans = sorted([*listed, *unlisted], key=attrgetter("offset"))
-    return sum(span.kind is not SpanKind.LOOSE for span in unlisted)
 
 
 def _add_descriptions(catalog: Catalog, loaded: Loaded) -> None:
@@ -430,8 +424,7 @@ def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
             catalog.counts[number] = catalog.counts.get(number, 0) + count
         if messages.log_time.size:
             first, last = int(messages.log_time.min()), int(messages.log_time.max())
-            catalog.start_ns = first if catalog.start_ns is None else min(first, catalog.start_ns)
-            catalog.end_ns = last if catalog.end_ns is None else max(last, catalog.end_ns)
+            catalog.add_times(first, last)
             if span.start_ns is None:
                 span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
         examined.append(replace(span, channels=frozenset(numbers.tolist())))

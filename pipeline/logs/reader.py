@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import Ints, group_by, map_in_order, name_first, usable_threads
-from pipeline.logs.bags import read_bag
+from pipeline.logs.bags import read_database
 from pipeline.logs.catalog import Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
+from pipeline.logs.chunks import Span, SpanKind
 from pipeline.logs.columns import (
     STAMPS,
     Column,
@@ -35,9 +36,9 @@ from pipeline.logs.columns import (
 from pipeline.logs.decode import take_rows
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
 from pipeline.logs.part import count_fetched, hash_sources, open_source
-from pipeline.logs.records import ByteSource, LogError, Loss
+from pipeline.logs.records import SQLITE_BAG, ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
-from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
+from pipeline.logs.spans import Loaded, load_spans
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,10 +362,10 @@ def _list_schemas(index: LogIndex) -> dict[int, bytes]:
 
 def _read_part(source: ByteSource, part: Part, wanted: set[int], threads: int) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
-    if container := part.catalog.container:
+    if part.catalog.container == SQLITE_BAG:
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
-        held = read_bag(part.path, container, own, most)
-        return (_gather_bag(part, payloads, losses) for payloads, losses in held)
+        held = read_database(part.path, part.catalog, own, most) if own else ()
+        return (_gather_rows(part, payloads, losses) for payloads, losses in held)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
@@ -376,9 +377,9 @@ def _read_part(source: ByteSource, part: Part, wanted: set[int], threads: int) -
     return load_spans(source, _spans_with(part, own), gather, threads=threads)
 
 
-def _gather_bag(part: Part, payloads: Mapping[int, Payloads], losses: list[Loss]) -> _Gathered:
+def _gather_rows(part: Part, payloads: Mapping[int, Payloads], losses: list[Loss]) -> _Gathered:
     merged = {part.numbers[number]: each for number, each in payloads.items()}
-    # Bags store no checksums of their messages.
+    # Databases store no checksums of their messages.
     stretch = int(bool(merged))
     return _Gathered(merged, losses, stretch, stretch, index_damaged=False)
 

@@ -2,7 +2,7 @@
 
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any, Final, Protocol, cast
@@ -155,6 +155,17 @@ LATEST_NS: Final = 1 << 62
 def clip_time(time: int) -> int:
     """A time of a recorder's clock [ns], which is 0 or `LATEST_NS` where no clock shows it."""
     return min(max(time, 0), LATEST_NS)
+
+
+def split_records(content: Buffer, start: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """Opcode, offset and end of the records of a stretch, up to the first bytes that cannot be one."""
+    while start + HEAD_SIZE <= end:
+        opcode, length = HEAD.unpack_from(content, start)
+        after = start + HEAD_SIZE + length
+        if after > end or length < LEAST_BODY.get(opcode, 0):
+            return
+        yield opcode, start, after
+        start = after
 
 
 class RecordError(ValueError):

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pipeline.core import Ints, group_rows, name_first
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
-from pipeline.logs.chunks import FIRST_PRIVATE
+from pipeline.logs.chunks import FIRST_PRIVATE, Span, SpanKind
 from pipeline.logs.records import ByteSource, Loss
-from pipeline.logs.spans import Span, SpanKind
 
 _FIRST_WINDOW: Final = 1 << 12
 _WINDOW: Final = 1 << 18
@@ -27,6 +26,8 @@ _LAST_BLOCK: Final = 1 << 20
 """First and largest block of a search [bytes]: blocks grow, so that dense damage does not make it slow."""
 
 _MAX_SIDE_RECORD: Final = 1 << 26
+_CHUNK_HEAD: Final = 128
+"""Bytes of a chunk that hold its head."""
 
 
 class Window:
@@ -50,7 +51,7 @@ class Window:
 
 
 class Scanner:
-    """Scans records into a catalog.
+    """Scans a file into a catalog.
 
     Args:
         source: the file.
@@ -61,13 +62,21 @@ class Scanner:
         self._source = source
         self._window = Window(source)
         self._catalog = catalog
-        self._known = {span.offset for span in catalog.spans}
         self._last_ns: int | None = None
 
-    def scan(self, start: int, stop: int) -> None:
-        """Scan the records in [start, stop); damage is recorded as a loss and skipped."""
-        position = start
-        previous = start
+    def scan(self, start: int, stop: int, listed: Sequence[Span]) -> None:
+        """Take the listed chunks, and scan the records in [start, stop) that they leave.
+
+        Damage is recorded as a loss and skipped.
+        """
+        for span in listed:
+            self._scan_gap(start, span.offset)
+            self._catalog.spans.append(span)
+            start = span.end
+        self._scan_gap(start, stop)
+
+    def _scan_gap(self, start: int, stop: int) -> None:
+        position = previous = start
         while position < stop:
             after = self._take(position, stop)
             if after is None:
@@ -76,49 +85,56 @@ class Scanner:
 
     def _take(self, position: int, stop: int) -> int | None:
         """Add the record at ``position`` to the catalog; returns the offset after it, None if invalid."""
-        head = self._window.view(position, rec.HEAD_SIZE)
-        if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
+        if position + rec.HEAD_SIZE > stop:
             return None
-        opcode, length = rec.HEAD.unpack(head)
+        head = self._window.view(position, rec.HEAD_SIZE)
+        opcode, length = rec.HEAD.unpack(head) if len(head) == rec.HEAD_SIZE else (0, 0)
         after: int = position + rec.HEAD_SIZE + length
-        if after > stop or length < rec.LEAST_BODY.get(opcode, 0):
+        is_cut = after > stop
+        if length < rec.LEAST_BODY.get(opcode, 0) or (is_cut and opcode != rec.CHUNK):
             return None
         if opcode not in rec.LEAST_BODY:
             return after if opcode >= FIRST_PRIVATE and self._goes_on(after, stop) else None
         try:
-            return after if self._note(opcode, position, length) else None
+            return min(after, stop) if self._note(opcode, position, after, stop) else None
         except rec.RecordError:
             return None
 
-    def _note(self, opcode: int, position: int, length: int) -> bool:
-        catalog = self._catalog
-        body_at = position + rec.HEAD_SIZE
+    def _note(self, opcode: int, position: int, after: int, stop: int) -> bool:
+        catalog, body_at = self._catalog, position + rec.HEAD_SIZE
+        last = catalog.spans[-1] if catalog.spans else None
         if opcode == rec.MESSAGE:
-            self._note_message(position, rec.HEAD_SIZE + length)
+            if (
+                last is not None
+                and last.kind is SpanKind.LOOSE
+                and last.end == position
+                and after - last.offset <= _LOOSE_SPAN
+            ):
+                catalog.spans[-1] = replace(last, length=after - last.offset)
+            else:
+                catalog.spans.append(Span(SpanKind.LOOSE, position, after - position))
         elif opcode == rec.CHUNK:
-            head = rec.parse_chunk_head(self._window.view(body_at, min(length, 128)), length)
-            if head.body + head.compressed_size != rec.HEAD_SIZE + length:
+            start = self._window.view(body_at, min(after - body_at, _CHUNK_HEAD, stop - body_at))
+            head = rec.parse_chunk_head(start, after - body_at)
+            if position + head.body + head.compressed_size != after:
                 return False
-            if position not in self._known:
-                self._note_chunk(SpanKind.CHUNK, position, rec.HEAD_SIZE + length, head)
+            kind = SpanKind.CHUNK if after <= stop else SpanKind.CUT_CHUNK
+            times = head.start_ns, head.end_ns
+            length, size = min(after, stop) - position, head.uncompressed_size
+            catalog.spans.append(Span(kind, position, length, 0, *times, inflated=size))
+            catalog.compressions.add(head.compression)
+            self._last_ns = max(head.end_ns, self._last_ns or 0)
         elif opcode == rec.MESSAGE_INDEX:
-            self._note_index(position, rec.HEAD_SIZE + length)
+            if last is not None and last.kind is SpanKind.CHUNK and last.end == position:
+                catalog.spans[-1] = replace(last, index_length=after - last.offset - last.length)
         elif opcode == rec.ATTACHMENT:
-            name = rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
-            catalog.side_records.add((position, rec.HEAD_SIZE + length, name))
+            name = rec.parse_attachment_name(self._window.view(body_at, min(after - body_at, 1 << 12)))
+            catalog.side_records.add((position, after - position, name))
             if catalog.extras.take(0, len(name)):
                 catalog.attachments.append(name)
-        elif length <= _MAX_SIDE_RECORD:
-            if opcode == rec.DATA_END:
-                catalog.data_end = position
-            self._note_small(opcode, position, self._window.view(body_at, length))
+        elif after - body_at <= _MAX_SIDE_RECORD:
+            self._note_small(opcode, position, self._window.view(body_at, after - body_at))
         return True
-
-    def _note_chunk(self, kind: SpanKind, position: int, length: int, head: rec.ChunkHead) -> None:
-        self._catalog.compressions.add(head.compression)
-        times = (head.start_ns, head.end_ns)
-        self._last_ns = max(head.end_ns, self._last_ns or 0)
-        self._catalog.spans.append(Span(kind, position, length, 0, *times, inflated=head.uncompressed_size))
 
     def _note_small(self, opcode: int, position: int, body: memoryview) -> None:
         catalog = self._catalog
@@ -127,71 +143,52 @@ class Scanner:
             catalog.side_records.add((position, rec.HEAD_SIZE + len(body), name))
             if catalog.extras.take(catalog.extras.most if entries is None else len(entries), len(body)):
                 catalog.metadata.append((name, entries or {}))
-            return
-        record = rec.parse_record(opcode, body)
-        if isinstance(record, Schema | Channel):
-            if catalog.data_end is None:
-                catalog.add_description(record, covered=False)
-            else:
-                catalog.repeated.append(record)
-        elif isinstance(record, Header):
-            catalog.profile, catalog.library = record.profile, record.library
         elif opcode == rec.DATA_END:
-            catalog.data_crc = int.from_bytes(body[:4], "little")
-
-    def _note_message(self, position: int, length: int) -> None:
-        spans = self._catalog.spans
-        if spans and spans[-1].kind is SpanKind.LOOSE:
-            last = spans[-1]
-            if last.offset + last.length == position and last.length + length <= _LOOSE_SPAN:
-                spans[-1] = replace(last, length=last.length + length)
-                return
-        spans.append(Span(SpanKind.LOOSE, position, length))
-
-    def _note_index(self, position: int, length: int) -> None:
-        spans = self._catalog.spans
-        if not spans or spans[-1].kind is not SpanKind.CHUNK:
-            return
-        last = spans[-1]
-        if last.offset + last.length + last.index_length == position:
-            spans[-1] = replace(last, index_length=last.index_length + length)
+            catalog.data_end, catalog.data_crc = position, int.from_bytes(body[:4], "little")
+        record = rec.parse_record(opcode, body)
+        if isinstance(record, Header):
+            catalog.profile, catalog.library = record.profile, record.library
+        elif isinstance(record, Schema | Channel) and catalog.data_end is not None:
+            catalog.repeated.append(record)
+        elif isinstance(record, Schema | Channel):
+            catalog.add_description(record, covered=False)
 
     def _goes_on(self, position: int, stop: int) -> bool:
+        """Whether the next records are possible."""
         for _ in range(_CHAIN):
             if position == stop:
                 return True
             head = self._window.view(position, rec.HEAD_SIZE)
-            if len(head) < rec.HEAD_SIZE:
-                return False
-            opcode, length = rec.HEAD.unpack(head)
-            if length < rec.LEAST_BODY.get(opcode, 1 << 62):
-                return False
+            opcode, length = rec.HEAD.unpack(head) if len(head) == rec.HEAD_SIZE else (0, 0)
             position += rec.HEAD_SIZE + length
-            if position > stop:
+            if length < rec.LEAST_BODY.get(opcode, 1 << 62) or position > stop:
                 return False
             if opcode == rec.FOOTER:
-                return True
+                break
         return True
 
     def _recover(self, previous: int, position: int, stop: int) -> tuple[int, int]:
         """Record damage at ``position``; returns the offset of the next record and that of the damage."""
-        if self._take_cut_chunk(position, stop):
-            return stop, position
-        last = self._catalog.spans[-1] if self._catalog.spans else None
-        again = self._find(position + 1, stop)
+        spans, again = self._catalog.spans, self._find(position + 1, stop)
+        last = spans[-1] if spans else None
         if (
             last is not None
             and last.kind is SpanKind.LOOSE
-            and last.offset <= previous < position == last.offset + last.length
+            and last.offset <= previous < position == last.end
         ):
             inside = self._find(previous + 1, stop)
             if inside < position:
                 # The length of the message before is damaged.
-                self._catalog.spans.pop()
-                if previous > last.offset:
-                    self._catalog.spans.append(replace(last, length=previous - last.offset))
                 position, again = previous, inside
-        self._note_damage(position, again, stop)
+                spans[-1:] = [replace(last, length=previous - last.offset)] if previous > last.offset else []
+        truncated = again == stop == self._source.size
+        kind = "truncated" if truncated else "damaged_record"
+        text = (
+            f"the file is truncated: its last {again - position} bytes are no complete record"
+            if truncated
+            else f"bytes {position} to {again} hold no record"
+        )
+        self._catalog.losses.append(Loss(kind, text, bytes=again - position, start_ns=self._last_ns))
         return again, position
 
     def _find(self, start: int, stop: int) -> int:
@@ -206,33 +203,6 @@ class Scanner:
                     return low + int(inner)
             low, size = low + high, min(2 * size, _LAST_BLOCK)
         return stop
-
-    def _take_cut_chunk(self, position: int, stop: int) -> bool:
-        """Add the chunk at ``position`` if its end is missing; returns whether there is such a chunk."""
-        head = self._window.view(position, 128)
-        if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
-            return False
-        opcode, length = rec.HEAD.unpack_from(head, 0)
-        if opcode != rec.CHUNK or position + rec.HEAD_SIZE + length <= stop:
-            return False
-        try:
-            chunk = rec.parse_chunk_head(head[rec.HEAD_SIZE : stop - position], length)
-        except rec.RecordError:
-            return False
-        if chunk.body + chunk.compressed_size != rec.HEAD_SIZE + length:
-            return False
-        self._note_chunk(SpanKind.CUT_CHUNK, position, stop - position, chunk)
-        return True
-
-    def _note_damage(self, start: int, end: int, stop: int) -> None:
-        truncated = end == stop == self._source.size
-        kind = "truncated" if truncated else "damaged_record"
-        text = (
-            f"the file is truncated: its last {end - start} bytes are no complete record"
-            if truncated
-            else f"bytes {start} to {end} hold no record"
-        )
-        self._catalog.losses.append(Loss(kind, text, bytes=end - start, start_ns=self._last_ns))
 
 
 def _possible_places(data: NDArray[np.uint8], high: int, end: int) -> Ints:
@@ -250,7 +220,7 @@ def _possible_places(data: NDArray[np.uint8], high: int, end: int) -> Ints:
 _STEPS_PER_JUMP: Final = 20
 """Minimum number of increments by one per jump; below it, sequence numbers do not count messages."""
 
-Numbered: TypeAlias = tuple[Span, NDArray[np.uint16], NDArray[np.uint32], Ints]
+Numbered: TypeAlias = tuple[Span, NDArray[np.integer], NDArray[np.uint32], Ints]
 """A whole chunk with channels, sequence numbers and log times [ns] of its messages."""
 
 
@@ -270,7 +240,7 @@ def find_missing(chunks: Sequence[Numbered], channels: Mapping[int, Channel]) ->
     channel, sequence, time = (np.concatenate(column) for column in columns)
     sequence = sequence.astype(np.int64)
     chunk = np.repeat(np.arange(len(spans)), [len(column) for column in columns[0]])
-    apart = [a.offset + a.length + a.index_length != b.offset for a, b in pairwise(spans)]
+    apart = [a.end != b.offset for a, b in pairwise(spans)]
     stretch = np.append(0, np.cumsum(apart))[chunk]
 
     def find_jumps(rows: Ints) -> Ints | None:

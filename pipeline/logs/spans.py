@@ -4,7 +4,6 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
@@ -13,50 +12,14 @@ from numpy.typing import NDArray
 from pipeline.core import map_in_order
 from pipeline.logs import chunks
 from pipeline.logs import records as rec
-from pipeline.logs.chunks import Messages, locate_messages
+from pipeline.logs.chunks import Messages, Span, SpanKind, locate_messages
 from pipeline.logs.records import Buffer, ByteSource, Loss
-
-# Spans of a log, and reading one of them.
-#
-# A span is a chunk with the message indexes after it, or a range of message records outside chunks.
+from pipeline.logs.ros1 import load_ros1
 
 Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
 
 _MAX_SPAN: Final = chunks.MAX_CHUNK + (64 << 20)
 """Maximum size of one read [bytes]: the largest chunk and its message indexes."""
-
-
-class SpanKind(Enum):
-    """Kind of a span."""
-
-    CHUNK = "chunk"
-    LOOSE = "loose"
-    CUT_CHUNK = "cut chunk"
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """A range of the file that contains messages.
-
-    Attributes:
-        kind: kind of the span.
-        offset: offset of its first byte in the file.
-        length: size without its message indexes [bytes].
-        index_length: size of the message indexes after it [bytes].
-        start_ns: first log time as stated by the summary or the chunk, None if unknown.
-        end_ns: last log time, None if unknown.
-        channels: numbers of the channels in it, None if unknown.
-        inflated: inflated size of a chunk as stated by the summary or its header [bytes].
-    """
-
-    kind: SpanKind
-    offset: int
-    length: int
-    index_length: int = 0
-    start_ns: int | None = None
-    end_ns: int | None = None
-    channels: frozenset[int] | None = None
-    inflated: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +47,8 @@ def load_span(source: ByteSource, span: Span) -> Loaded:
         return _lost(span, "too_large", f"more than {_MAX_SPAN >> 20} MiB at once are not read")
     blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
     try:
+        if span.kind is SpanKind.BAG_CHUNK:
+            return Loaded(*load_ros1(span, blob), unchecked=True)
         if span.kind is not SpanKind.LOOSE:
             return _load_chunk(span, blob)
     except (rec.RecordError, struct.error) as error:
@@ -137,18 +102,15 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer) -> Loaded:
 
 
 def _read_entries(blob: Buffer) -> list[Entries] | None:
+    """Channels and entries of the message indexes after a chunk; None if there are none that can be read."""
     entries: list[Entries] = []
-    position = 0
-    while position + rec.HEAD_SIZE <= len(blob):
-        opcode, length = rec.HEAD.unpack_from(blob, position)
-        position += rec.HEAD_SIZE
-        if opcode != rec.MESSAGE_INDEX or length > len(blob) - position:
+    for opcode, position, end in rec.split_records(blob, 0, len(blob)):
+        if opcode != rec.MESSAGE_INDEX:
             return None
         try:
-            entries.append(rec.parse_message_index(blob[position : position + length]))
+            entries.append(rec.parse_message_index(blob[position + rec.HEAD_SIZE : end]))
         except rec.RecordError:
             return None
-        position += length
     return entries or None
 
 

@@ -6,37 +6,45 @@ The accepted forms of a column are normalized, and columns serialized as CDR in 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise, repeat
+from operator import itemgetter
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, Self, TypeAlias
+from typing import Any, BinaryIO, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Ints, group_rows, name_first
-from pipeline.logs.cdr import RowBuffer, RowWriter
+from pipeline.core import Ints, group_by, name_first
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.decode import Leaf, plan_fields, wanted_leaves
 from pipeline.logs.records import LogError, unsupported
-from pipeline.logs.schema import Structure, definition_text, leaf_paths, parse_msg
+from pipeline.logs.schema import (
+    NUMBER_TYPES,
+    SEQUENCE,
+    SIZES,
+    Member,
+    Structure,
+    definition_text,
+    leaf_paths,
+    parse_msg,
+)
 
 Given: TypeAlias = "NDArray[np.generic] | Ragged | RaggedStrings | Strings | float | str | Sequence[object]"
 """One value for all messages, or one per message."""
 
 
-def normalize_columns(
-    structure: Structure, rows: int, fields: Mapping[str, Given], *, where: str
-) -> dict[str, Column]:
-    """Convert given values to the columns that reading would return.
+def encode_rows(structure: Structure, rows: int, fields: Mapping[str, Given], *, where: str) -> list[bytes]:
+    """Serialize messages as CDR: little-endian XCDR1, as ROS 2 recorders write.
 
     A single number or string applies to all messages, and so does one list of strings for a sequence of
     strings. For a field in a sequence of structures, one value per message gives sequences of length one, an
     array (n, k) sequences of length k; the sequences of one message have equal lengths.
 
     Args:
-        structure: the type.
+        structure: type of the messages.
         rows: number of messages.
-        fields: values by leaf path.
+        fields: values by leaf path; absent fields are zero or empty.
         where: topic named in errors.
 
     Raises:
@@ -48,88 +56,82 @@ def normalize_columns(
             hint = f"The type has: {name_first(leaves)}"
             raise LogError("field_not_found", f"there is not a field {path}", where=where, hint=hint)
     if rows == 0:
-        return {}
-    wanted = dict(wanted_leaves(plan_fields(structure, set(fields))))
+        return []
     columns: dict[str, Column] = {}
-    for path, leaf in wanted.items():
+    for path, leaf in wanted_leaves(plan_fields(structure, set(fields))):
         try:
             columns[path] = _normalize(fields[path], leaf, rows, inside="[]." in path)
         except (ValueError, TypeError, OverflowError) as error:
             hint = f"Give one value, or {rows} of the field's type"
             raise LogError("bad_column", f"field {path}: {error}", where=where, hint=hint) from None
     _match_sequences(columns, rows, where)
-    return columns
+    texts = {
+        path: [text.encode() + b"\0" for text in column.values]
+        for path, column in columns.items()
+        if isinstance(column, Strings | RaggedStrings)
+    }
+    payloads = [b""] * rows
+    for chosen in _group_by_layout(columns, texts, rows):
+        writer = _RowWriter(
+            {path: _select(column, chosen) for path, column in columns.items()}, texts, chosen
+        )
+        writer.write(structure, "", None)
+        for row, payload in zip(chosen.tolist(), writer.fill(), strict=True):
+            payloads[row] = payload.tobytes()
+    return payloads
 
 
 def _normalize(given: Given, leaf: Leaf, rows: int, *, inside: bool) -> Column:
+    """Column of a field as reading would return it."""
     if leaf.text:
         return _normalize_texts(given, leaf, rows, inside=inside)
-    if isinstance(given, Ragged):
-        return Ragged(_cast(given.values, leaf.nothing.dtype), _check_offsets(given.offsets, rows))
+    kind, width = leaf.nothing.dtype, leaf.nothing.shape[1:]
     if leaf.ragged and isinstance(given, Sequence) and not isinstance(given, str):
         each_row = [np.atleast_1d(np.asarray(each)) for each in given]
         sizes = [row.size for row in each_row]
         if len(set(sizes)) > 1:
-            joined = np.concatenate(each_row)
-            return Ragged(_cast(joined, leaf.nothing.dtype), _check_offsets(np.r_[0, np.cumsum(sizes)], rows))
-    values = _cast(np.asarray(given), leaf.nothing.dtype)
-    width = leaf.nothing.shape[1:]
-    if leaf.ragged:
-        values = (
-            values.reshape(rows, -1)
-            if values.ndim and values.shape[0] == rows
-            else np.broadcast_to(values, (rows, values.size if values.ndim else 1))
-        )
-        count = values.shape[1]
-        return Ragged(values.reshape(-1), np.arange(rows + 1, dtype=np.int64) * count)
-    return np.broadcast_to(values, (rows, *width))
+            given = Ragged(np.concatenate(each_row), np.r_[0, np.cumsum(sizes)])
+    if isinstance(given, Ragged):
+        if len(given) != rows:
+            raise ValueError(f"sequences of {len(given)} messages for {rows}")
+        return Ragged(_cast(given.values, kind), given.offsets.astype(np.int64))
+    values = _cast(np.asarray(given), kind)
+    if not leaf.ragged:
+        return np.broadcast_to(values, (rows, *width))
+    if not values.ndim or values.shape[0] != rows:
+        values = np.broadcast_to(values, (rows, values.size))
+    values = values.reshape(rows, -1)
+    return Ragged(values.reshape(-1), np.arange(rows + 1, dtype=np.int64) * values.shape[1])
 
 
 def _normalize_texts(given: Given, leaf: Leaf, rows: int, *, inside: bool) -> Column:
-    if isinstance(given, RaggedStrings):
-        _check_offsets(given.offsets, rows)
-        return given if leaf.ragged else Strings(given.codes, given.values)
-    if isinstance(given, Strings):
-        if given.codes.size != rows:
-            raise ValueError(f"{given.codes.size} strings for {rows} messages")
-        if not leaf.ragged:
-            return given
-        return RaggedStrings(given.codes, given.values, np.arange(rows + 1, dtype=np.int64))
-    if isinstance(given, str):
-        codes = np.zeros(rows, dtype=np.int32)
-        return _normalize_texts(Strings(codes, (given,)), leaf, rows, inside=inside)
-    if not isinstance(given, Sequence | np.ndarray):
-        raise TypeError(f"{given!r} is not a string")
-    items = given.tolist() if isinstance(given, np.ndarray) else list(given)
-    nested = bool(items) and not isinstance(items[0], str)
-    if leaf.ragged and not nested and (not inside or len(items) != rows):
-        items, nested = [items] * rows, True
-    if len(items) != rows:
-        raise ValueError(f"{len(items)} strings for {rows} messages")
-    column = RaggedStrings.of_texts([_as_list(each) for each in items])
-    return column if leaf.ragged else Strings(column.codes, column.values)
-
-
-def _as_list(given: object) -> list[str]:
-    if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
-        return [str(text) for text in given]
-    return [str(given)]
+    column = given
+    if not isinstance(column, RaggedStrings):
+        if not isinstance(given, Strings | Sequence | np.ndarray):
+            raise TypeError(f"{given!r} is not a string")
+        items: list[Any] = given.to_list() if isinstance(given, Strings) else list(given)
+        if isinstance(given, str):
+            items = [[given]] * rows
+        elif (
+            leaf.ragged
+            and not (inside and len(items) == rows)
+            and all(isinstance(each, str) for each in items)
+        ):
+            items = [items] * rows
+        column = RaggedStrings.of_texts(
+            [[each] if isinstance(each, str) else list(map(str, each)) for each in items]
+        )
+    if len(column) != rows:
+        raise ValueError(f"{len(column)} strings for {rows} messages")
+    return column if leaf.ragged else column.at(0)
 
 
 def _cast(values: NDArray[np.generic], kind: np.dtype[np.generic]) -> NDArray[np.generic]:
-    if kind == values.dtype:
-        return values
     with np.errstate(invalid="ignore"):
-        cast = values.astype(kind)
+        cast = values.astype(kind, copy=False)
     if kind.kind in "iu" and not (cast == values).all():
         raise ValueError(f"the values do not fit {kind.name}")
     return cast
-
-
-def _check_offsets(offsets: Ints, rows: int) -> Ints:
-    if offsets.size != rows + 1:
-        raise ValueError(f"sequences of {offsets.size - 1} messages for {rows}")
-    return offsets.astype(np.int64)
 
 
 def _match_sequences(columns: Mapping[str, Column], rows: int, where: str) -> None:
@@ -148,71 +150,114 @@ def _match_sequences(columns: Mapping[str, Column], rows: int, where: str) -> No
             )
 
 
-def encode_rows(
-    structure: Structure, rows: int, fields: Mapping[str, Given], *, where: str
-) -> Iterator[tuple[Ints, NDArray[np.uint8]]]:
-    """Serialize messages.
-
-    Args:
-        structure: type of the messages.
-        rows: number of messages.
-        fields: values by leaf path; absent fields are zero or empty.
-        where: topic named in errors.
-
-    Yields:
-        Indices of the rows of one layout, and their payloads as (m, length) bytes.
-
-    Raises:
-        LogError: ``field_not_found``, ``bad_column``.
-    """
-    columns = normalize_columns(structure, rows, fields, where=where)
-    texts = {path: _encode_texts(column) for path, column in columns.items()}
-    for chosen in _group_by_layout(columns, texts, rows):
-        buffer = RowBuffer(chosen.size)
-        RowWriter(columns, texts, buffer).write(structure, chosen, "", None)
-        yield chosen, buffer.fill()
-
-
-def _encode_texts(column: Column) -> list[bytes]:
-    if isinstance(column, Strings | RaggedStrings):
-        return [text.encode() + b"\0" for text in column.values]
-    return []
-
-
 def _group_by_layout(
     columns: Mapping[str, Column], texts: Mapping[str, list[bytes]], rows: int
 ) -> list[Ints]:
-    keys: list[Ints] = []
+    """Rows whose strings and sequences have equal lengths: in them every field has one place."""
+    layouts: list[tuple[object, ...]] = [()] * rows
     for path, column in columns.items():
-        lengths = np.array([len(text) for text in texts[path]], dtype=np.int64)
+        lengths = np.array([len(text) for text in texts.get(path, ())], dtype=np.int64)
+        keys: list[Any] = []
         if isinstance(column, Strings):
-            keys.append(lengths[column.codes])
+            keys = lengths[column.codes].tolist()
+        elif isinstance(column, RaggedStrings) and np.unique(lengths).size > 1:
+            each = lengths[column.codes]
+            keys = [each[a:b].tobytes() for a, b in pairwise(column.offsets.tolist())]
         elif isinstance(column, Ragged | RaggedStrings):
-            keys.append(np.diff(column.offsets))
-            if isinstance(column, RaggedStrings) and np.unique(lengths).size > 1:
-                keys.append(_number_rows(lengths[column.codes], column.offsets))
-    varying = [key for key in keys if rows and (key != key[0]).any()]
-    everyone = np.arange(rows)
-    if not varying:
-        return [everyone] if rows else []
-    _, group = np.unique(np.stack(varying, axis=1), axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    return group_rows(group)
+            keys = np.diff(column.offsets).tolist()
+        if any(key != keys[0] for key in keys):
+            layouts = [(*layout, key) for layout, key in zip(layouts, keys, strict=True)]
+    return [np.array(each) for each in group_by(zip(layouts, range(rows), strict=True)).values()]
 
 
-def _number_rows(values: Ints, offsets: Ints) -> Ints:
-    counts = np.diff(offsets)
-    if (counts == counts[0]).all():
-        _, number = np.unique(values.reshape(counts.size, -1), axis=0, return_inverse=True)
-        return number.reshape(-1).astype(np.int64)
-    numbers: dict[bytes, int] = {}
-    return np.array(
-        [
-            numbers.setdefault(values[a:b].tobytes(), len(numbers))
-            for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True)
-        ],
-        dtype=np.int64,
-    )
+def _select(column: Column, rows: Ints) -> NDArray[np.generic]:
+    """Numbers or codes of strings of rows of one layout, shape (n, ...)."""
+    if isinstance(column, np.ndarray):
+        return column[rows]
+    values = column.values if isinstance(column, Ragged) else column.codes
+    if isinstance(column, Strings):
+        return values[rows]
+    start, count = column.offsets[rows], np.diff(column.offsets)[rows[0]]
+    return values[start[:, None] + np.arange(count)]
+
+
+_ENCAPSULATION: Final = b"\x00\x01\x00\x00"
+
+
+class _RowWriter:
+    """Writes rows of one layout: every field is one block of bytes at one offset after the encapsulation.
+
+    Args:
+        columns: numbers or codes of strings by leaf path, shape (n, ...).
+        texts: encoded strings by leaf path and code.
+        rows: the rows, shape (n,).
+    """
+
+    def __init__(
+        self, columns: Mapping[str, NDArray[np.generic]], texts: Mapping[str, list[bytes]], rows: Ints
+    ) -> None:
+        self._columns, self._texts, self._rows = columns, texts, rows.size
+        self._written: list[tuple[int, NDArray[np.uint8]]] = []
+        self._end = 0
+
+    def write(self, structure: Structure, prefix: str, element: int | None) -> None:
+        """Write one structure of every row; ``element`` is its index in the enclosing sequence."""
+        if not structure.members:
+            self._put("uint8", np.zeros(self._rows))
+        for member in structure.members:
+            path = f"{prefix}{member.name}"
+            if not isinstance(member.element, Structure):
+                self._write_leaf(member, member.element, path, element)
+            elif member.count is None:
+                self.write(member.element, f"{path}.", element)
+            else:
+                below = (column for name, column in self._columns.items() if name.startswith(f"{path}[]."))
+                count = next((column.shape[1] for column in below), 0)
+                if member.count == SEQUENCE:
+                    self._put("uint32", np.full(self._rows, count))
+                for number in range(count if member.count == SEQUENCE else member.count):
+                    self.write(member.element, f"{path}[].", number)
+
+    def _write_leaf(self, member: Member, kind: str, path: str, element: int | None) -> None:
+        values = self._columns.get(path)
+        if values is None:
+            width = {None: 1, SEQUENCE: 0}.get(member.count, member.count)
+            values = np.zeros((self._rows, width or 0), dtype=np.int64)
+        elif element is not None:
+            values = values[:, element]
+        values = values.reshape(self._rows, -1)
+        if member.count == SEQUENCE:
+            self._put("uint32", np.full(self._rows, values.shape[1]))
+        if kind != "string":
+            self._put(kind, values)
+            return
+        for codes in values.T:
+            present, position = np.unique(codes, return_inverse=True)
+            texts = [self._texts.get(path, [b"\0"])[code] for code in present.tolist()]
+            table = np.frombuffer(b"".join(texts), dtype=np.uint8).reshape(len(texts), -1)
+            self._put("uint32", np.full(self._rows, table.shape[1]))
+            self._put("uint8", table[position.reshape(-1)])
+
+    def _put(self, kind: str, values: NDArray[np.generic]) -> None:
+        """Append aligned numbers, the same number to every row."""
+        if values.size:
+            size = SIZES[kind]
+            stored = np.ascontiguousarray(
+                values.reshape(self._rows, -1), dtype=NUMBER_TYPES[kind].newbyteorder("<")
+            )
+            block = stored.view(np.uint8).reshape(self._rows, -1)
+            start = -(-self._end // size) * size
+            self._written.append((start, block))
+            self._end = start + block.shape[1]
+
+    def fill(self) -> NDArray[np.uint8]:
+        """The payloads as bytes, shape (n, length)."""
+        head = len(_ENCAPSULATION)
+        filled = np.zeros((self._rows, head + self._end), dtype=np.uint8)
+        filled[:, :head] = np.frombuffer(_ENCAPSULATION, dtype=np.uint8)
+        for start, block in self._written:
+            filled[:, head + start : head + start + block.shape[1]] = block
+        return filled
 
 
 LIBRARY: Final = "slip-pipeline"
@@ -223,18 +268,6 @@ _SECOND: Final = 1_000_000_000
 class _Type(NamedTuple):
     schema_id: int
     structure: Structure
-
-
-class _Rows(NamedTuple):
-    """Messages of one channel and length: log times [ns], sequence numbers (n,), payloads (n, length)."""
-
-    channel: int
-    log_time: Ints
-    sequence: Ints
-    payloads: NDArray[np.uint8]
-
-    def select(self, chosen: Flags) -> _Rows:
-        return _Rows(self.channel, *(getattr(self, name)[chosen] for name in self._fields[1:]))
 
 
 class LogWriter:
@@ -263,7 +296,7 @@ class LogWriter:
         self._types: dict[str, _Type] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
-        self._waiting: list[_Rows] = []
+        self._waiting: list[tuple[int, int, int, bytes]] = []
         try:
             self._file: BinaryIO = self._draft.open("wb")
         except OSError as error:
@@ -301,7 +334,7 @@ class LogWriter:
             topic: name of the topic.
             type_name: ``package/msg/Name``.
             log_time: [ns], int64, shape (n,), in any order.
-            fields: values by leaf path (see ``normalize_columns``); absent fields are zero or empty.
+            fields: values by leaf path (see ``encode_rows``); absent fields are zero or empty.
             header_time: stamps [ns] for ``header.stamp``, or for ``transforms[].header.stamp``.
             definition: ``ros2msg`` definition of a type that is not bundled.
 
@@ -319,30 +352,21 @@ class LogWriter:
         channel = self._channel(topic, kind)
         first = self._sequences[channel]
         self._sequences[channel] += log.size
-        for rows, payloads in encode_rows(kind.structure, log.size, given, where=topic):
-            self._waiting.append(_Rows(channel, log[rows], first + rows, payloads))
+        payloads = encode_rows(kind.structure, log.size, given, where=topic)
+        rows = range(first, first + log.size)
+        self._waiting += zip(log.tolist(), repeat(channel), rows, payloads, strict=False)
 
     def close(self) -> None:
         """Write all remaining messages and rename the file to its final name."""
-        self._write(self._waiting)
+        # Messages with equal times stay in the order in which they were added.
+        for time, channel, number, payload in sorted(self._waiting, key=itemgetter(0)):
+            self._mcap.add_message(channel, time, payload, time, number)
         self._waiting = []
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
         self._draft.replace(self._path)
-
-    def _write(self, waiting: list[_Rows]) -> None:
-        empty = np.empty(0, dtype=np.int64)
-        log = np.concatenate([empty, *(rows.log_time for rows in waiting)])
-        owner = np.concatenate([empty, *(np.full(rows.log_time.size, n) for n, rows in enumerate(waiting))])
-        inside = np.concatenate([empty, *(np.arange(rows.log_time.size) for rows in waiting)])
-        # Messages with equal times stay in the order in which they were added.
-        order = np.argsort(log, kind="stable")
-        for number, row in zip(owner[order].tolist(), inside[order].tolist(), strict=True):
-            rows = waiting[number]
-            time, payload = int(rows.log_time[row]), rows.payloads[row].tobytes()
-            self._mcap.add_message(rows.channel, time, payload, time, int(rows.sequence[row]))
 
     def discard(self) -> None:
         """Delete the unfinished file."""

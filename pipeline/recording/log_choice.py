@@ -45,7 +45,6 @@ from pipeline.sources import (
     DriveSource,
     PoseSource,
     Recognized,
-    Signal,
     Sources,
     Vehicle,
     VehicleSource,
@@ -56,7 +55,7 @@ from pipeline.sources import (
     is_localization,
     list_contradictions,
     list_metadata,
-    list_topics,
+    list_named,
     make_vehicle,
     plain_type,
     read_description,
@@ -243,11 +242,16 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
             fitted; several robots.
         LogError: the log cannot be read.
     """
-    named = _list_named(configuration)
+    named, description, controller = (
+        list_named(configuration),
+        find_description(index),
+        find_controller(index),
+    )
     findings: list[Finding] = []
     while True:
         try:
-            chosen = _choose_readable(index, configuration, overrides)
+            recognized = recognize_vehicle(index.channels, index.metadata, description, named)
+            chosen = _choose_readable(index, configuration, overrides, recognized, controller)
         except LogError as error:
             # Of some encodings, only the messages tell which fields there are.
             topic = next((one for one in index.topics() if error.where == f"{index.path}, topic {one}"), None)
@@ -261,26 +265,14 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
             return replace(chosen, findings=(*findings, *chosen.findings))
 
 
-def _list_named(configuration: Configuration) -> list[str]:
-    """Topics that the configuration names."""
-    pose = configuration.pose
-    named = (
-        pose.topic,
-        configuration.imu.topic,
-        *filter(None, (pose.x, pose.y, pose.yaw)),
-        *list_topics(configuration.command),
-        *list_topics(configuration.wheels),
-    )
-    return [Signal.parse(text).topic for text in named if text]
-
-
 def _choose_readable(
-    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]
+    index: LogIndex,
+    configuration: Configuration,
+    overrides: Mapping[str, object],
+    recognized: Recognized | None,
+    controller: Controller | None,
 ) -> Choice:
     where = str(index.path)
-    named = _list_named(configuration)
-    recognized = recognize_vehicle(index.channels, index.metadata, find_description(index), named)
-    controller = find_controller(index)
     known: dict[str, float] = {}
     if recognized is None:
         recognized, known = _recognize_geometry(index, configuration, controller)

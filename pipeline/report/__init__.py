@@ -37,7 +37,7 @@ from pipeline.core import (
     shorten,
     suffix_unit,
 )
-from pipeline.store import LOG_NOTES, Manifest, Store, date_runs, scan_table
+from pipeline.store import LOG_NOTES, Manifest, Store, date_runs
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -381,9 +381,9 @@ def list_failed(store: Store) -> list[dict[str, str]]:
 
 
 def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
-    runs = scan_table("runs", root=store.root, manifests=manifests).collect()
+    runs = store.scan("runs", manifests).collect()
     medians = (
-        scan_table("aggregates", root=store.root, manifests=manifests)
+        store.scan("aggregates", manifests)
         .filter(pl.col("subset") == "all")
         .select("run", "input", "median_modulus", "distance")
         .collect()

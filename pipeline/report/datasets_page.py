@@ -32,7 +32,7 @@ from pipeline.report import (
     theme,
     write_page,
 )
-from pipeline.report.page import add_figures, render_figures
+from pipeline.report.page import render_figures, write_pictures
 from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axis
 from pipeline.store import Store
 from pipeline.words import list_answer, list_shown_notes
@@ -94,7 +94,9 @@ def _write(
             tables=[one for one in tables if one.rows], notes=notes, runs=runs,
         )  # fmt: skip
         written[name] = write_page(store, name, page)
-    return written | add_figures(store, lambda: pictures, figures)
+    if figures is not None:
+        written |= {path.name: path for path in write_pictures(pictures, store.root / "figures", figures)}
+    return written
 
 
 def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:

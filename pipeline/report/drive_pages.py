@@ -1,6 +1,5 @@
 """Page of a drive: the plan of `slip plan`."""
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,10 +15,8 @@ from pipeline.report.page import render_figures
 from pipeline.report.theme import (
     Chart,
     Drawing,
-    build_spec,
     encode_column,
     layer,
-    share_rows,
     stack,
 )
 from pipeline.store import (
@@ -41,23 +38,6 @@ _WIDTH = 640
 _ROOM = 1.2
 _LEAST = 0.1
 _PLACE = re.compile(r'<div id="planned">.*?</div>', re.DOTALL)
-
-
-def preview_plan(plan: Plan) -> dict[str, object]:
-    """Short form of a plan for a page that draws it: figures, rows, and lines of text."""
-    picture = _draw_ways(plan, most=8, every=2 * _EVERY)
-    return {
-        "figures": {picture.id: build_spec(picture.drawing)},
-        "rows": share_rows([picture.drawing]),
-        "dark": dict(theme.DARK_TWINS),
-        "words": picture.drawing.words,
-        "safety": SAFETY,
-        "drives": bool(plan.manoeuvres),
-        "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
-        "duration_s": plan.commands.duration_s,
-        "play": _format_play(plan),
-        "gains": plan.list_rows(),
-    }
 
 
 def show_planned(page: str, planned: Mapping[str, object]) -> str:
@@ -91,20 +71,16 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             f"at most {set_squares(plan.limits.format(steered=plan.steered))}",
         ],
         safety=SAFETY,
-        play=_format_play(plan),
+        play=f"ros2 bag play plan.mcap    # {plan.type_name} on {plan.topic}",
         rows=plan.list_rows(),
         has_intervals=any(one.kind == "interval" for one in plan.informative),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 
 
-def _format_play(plan: Plan) -> str:
-    return f"ros2 bag play plan.mcap    # {plan.type_name} on {plan.topic}"
-
-
-def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
+def _draw_ways(plan: Plan) -> Picture:
     """Draw the expected path, those of other models, and the area."""
-    ways = plan.ways[:: max(len(plan.ways) // most, 1), ::every]
+    ways = plan.ways[:: max(len(plan.ways) // _MOST_WAYS, 1), ::_EVERY]
     rows = pl.concat(
         pl.DataFrame(
             {
@@ -184,7 +160,7 @@ def locate_plan(results: Path, run: str, name: str) -> Path:
 
 
 class _Preview(msgspec.Struct):
-    """Summary of a plan for a report: key of the results it was made for, and fields of `preview_plan`."""
+    """Summary of a plan for a report, with the key of the results that it was made for."""
 
     key: str
     drives: bool
@@ -254,8 +230,9 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         if name not in written:
             # Files of an earlier plan are obsolete.
             (preview.parent / name).unlink(missing_ok=True)
-    content = {"key": manifest.key, **preview_plan(plan)}
-    replace_file(preview, json.dumps(content, allow_nan=False).encode())
+    area = f"{plan.area.length_m:g} x {plan.area.width_m:g} m"
+    summary = _Preview(manifest.key, bool(plan.manoeuvres), area, plan.commands.duration_s, plan.list_rows())
+    replace_file(preview, msgspec.json.encode(summary))
     with store.open_generation(run, manifest.key) as generation:
         current = generation.previous
         if current is None or current.key != manifest.key or REPORT not in current.files:

@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.core import mapping_in, number_in, objects_in
 from pipeline.report.motion_view import MotionView
 from pipeline.report.theme import round_up, usual_ends
-from pipeline.results import Named, RunDiagnosis, find_refusal, is_small, read_findings, split_main
+from pipeline.results import RunDiagnosis, find_refusal, read_findings
 from pipeline.run import HORIZON_S
 
 INPUTS = ("command", "measured")
@@ -76,38 +76,9 @@ class RunReport:
         return format_verdict(self.diagnosis) if self.is_diagnosed else self.text("verdict")
 
     @property
-    def effects(self) -> tuple[list[Named], list[Named]]:
-        """Effects that remove at least a tenth of the error with corrected clocks, and the smaller ones."""
-        diagnosis = self.diagnosis
-        return split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
-
-    @property
     def refusal(self) -> str:
         """Finding that makes every fit to the run meaningless; empty without one."""
         return find_refusal(read_findings(self.summary))
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether a finding makes every fit to the run meaningless, so that no effect is reported."""
-        return bool(self.refusal)
-
-    @property
-    def undecided(self) -> list[tuple[str, str]]:
-        """Effects that explain the data equally well, and the manoeuvre that would separate them."""
-        from pipeline.words import describe_separation, name_group  # noqa: PLC0415 - heavy
-
-        return [(name_group(one.candidates), describe_separation(one)) for one in self.diagnosis.undecided]
-
-    @property
-    def small_groups(self) -> int:
-        """Number of undecided groups that count as one smaller effect each."""
-        return sum(is_small(group.in_model, self.diagnosis.ladder) for group in self.diagnosis.undecided)
-
-    @property
-    def split(self) -> tuple[float | None, float | None, float | None]:
-        """Shares of drivetrain, ground and cross term in the mean square of the slip from commands."""
-        split = self.part("split")
-        return number_in(split, "drivetrain"), number_in(split, "ground"), number_in(split, "cross")
 
     def text(self, key: str) -> str:
         """Text of the summary; empty if missing."""
@@ -252,7 +223,7 @@ _WIDEST_PIXELS = 1200
 _FAR_M = 10_000.0
 CAP_QUANTILE = 0.98
 """Quantile at the upper end of colours: a few samples of a stuck vehicle would dominate the scale."""
-_WORST_S = 20.0
+_WORST_S = 20
 STRETCH_S = 30.0
 _FEWEST = 5
 """Smallest number of predictions of a ranked stretch."""
@@ -364,14 +335,14 @@ class Scene:
         slip, domain = self.sound_slip.get(self.report.main_input), self.time_domain
         if slip is None or domain is None or domain[1] - domain[0] < 1.5 * _WORST_S:
             return None
-        squared = np.minimum(slip["modulus"].to_numpy(), self.modulus_cap) ** 2
-        seconds, position = np.unique(np.floor(slip["t"].to_numpy() - domain[0]), return_inverse=True)
-        summed = np.append(0.0, np.cumsum(np.bincount(position, squared)))
-        # The worst span ends or begins with a second that has slip, however long there was none.
-        starts = np.unique(np.concatenate((seconds, np.maximum(seconds + 1.0 - _WORST_S, 0.0))))
-        ends = np.searchsorted(seconds, starts + _WORST_S)
-        total = summed[ends] - summed[np.searchsorted(seconds, starts)]
-        start = min(domain[0] + float(starts[int(np.argmax(total))]), domain[1] - _WORST_S)
+        second = (pl.col("t") - domain[0]).floor().cast(pl.Int64).alias("second")
+        square = pl.col("modulus").clip(upper_bound=self.modulus_cap) ** 2
+        seconds = slip.group_by(second).agg(square.sum().alias("square")).sort("second")
+        totals = seconds.select(pl.col("square").rolling_sum_by("second", f"{_WORST_S}i"))["square"]
+        # The worst span ends with a second that has slip, however long there was none.
+        end = int(seconds["second"][totals.arg_max() or 0]) + 1
+        start = domain[0] + max(end - _WORST_S, 0)
+        start = min(start, domain[1] - _WORST_S)
         return start, start + _WORST_S
 
     @cached_property
@@ -493,7 +464,7 @@ class Scene:
     def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
         if not lines:
             return None
-        parts, drawn, total, ends = [], 0, 0, []
+        parts, drawn, total, ends = [], 0, 0, list[float]()
         for frame, column, series in lines:
             # Constant stretches are thinned first, so that a held command keeps its edges.
             line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")

@@ -9,11 +9,12 @@ import os
 import subprocess
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -27,9 +28,6 @@ SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 Channel = dict[str, object]
 
 _TYPES = {"Q": "quantitative", "N": "nominal"}
-
-# The second end of a span has the type of the first.
-_ENDS = frozenset({"x2", "y2"})
 
 
 def encode_column(name: str, **look: object) -> Channel:
@@ -45,26 +43,16 @@ def encode_column(name: str, **look: object) -> Channel:
     return {**what, "type": _TYPES[kind], **look}
 
 
-@dataclass(frozen=True)
-class Chart:
-    """Vega-Lite chart: one mark over named rows, or several charts.
+class Chart(dict[str, Any]):
+    """Vega-Lite specification of one mark over named rows, or of several charts.
 
     Every call returns a new chart; nothing is validated or deep-copied.
-
-    Attributes:
-        view: properties other than encoding and transforms.
-        encoding: channels of the mark.
-        transforms: transforms of the rows.
     """
-
-    view: Mapping[str, object]
-    encoding: Mapping[str, object] = field(default_factory=dict)
-    transforms: tuple[Mapping[str, object], ...] = ()
 
     @classmethod
     def of_rows(cls, name: str) -> Chart:
         """Chart of the rows of that name, without a mark."""
-        return cls({"data": {"name": name}})
+        return cls(data={"name": name})
 
     def mark(self, kind: str, **look: object) -> Chart:
         """Draw the rows as `line`, `point`, `rule`, ..."""
@@ -73,51 +61,34 @@ class Chart:
     def encode(self, **channels: object) -> Chart:
         """Set channels: a column as for `encode_column` or by its name, several columns, or a value."""
         named = {name: _complete(name, value) for name, value in channels.items()}
-        return replace(self, encoding={**self.encoding, **named})
+        return self.properties(encoding={**self.get("encoding", {}), **named})
 
     def filter(self, predicate: str) -> Chart:
         """Select the rows for which the expression is true."""
-        return self._transform({"filter": predicate})
-
-    def calculate(self, name: str, expression: str) -> Chart:
-        """Add a computed column."""
-        return self._transform({"calculate": expression, "as": name})
-
-    def _transform(self, step: Mapping[str, object]) -> Chart:
-        return replace(self, transforms=(*self.transforms, step))
+        return self.properties(transform=[{"filter": predicate}])
 
     def properties(self, **given: object) -> Chart:
         """Set width, height, title, usermeta, ..."""
-        return replace(self, view={**self.view, **given})
-
-    def resolve_scale(self, **channels: str) -> Chart:
-        """Set which scales the parts do not share."""
-        return self.properties(resolve={"scale": channels})
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the specification."""
-        view: dict[str, object] = {"encoding": dict(self.encoding)} if self.encoding else {}
-        if self.transforms:
-            view["transform"] = list(self.transforms)
-        return {**self.view, **view}
+        return Chart({**self, **given})
 
 
 def layer(*charts: Chart) -> Chart:
     """Overlay charts."""
-    return Chart({"layer": [chart.to_dict() for chart in charts]})
+    return Chart(layer=list(charts))
 
 
 def stack(*charts: Chart) -> Chart:
     """Stack charts vertically."""
-    return Chart({"vconcat": [chart.to_dict() for chart in charts]})
+    return Chart(vconcat=list(charts))
 
 
 def _complete(name: str, value: object) -> object:
+    if isinstance(value, list):
+        return [_complete(name, one) for one in value]
     if isinstance(value, str):
         value = encode_column(value)
-    elif isinstance(value, list):
-        return [_complete(name, one) for one in value]
-    if name in _ENDS and isinstance(value, dict):
+    # The second end of a span has the type of the first.
+    if name in {"x2", "y2"} and isinstance(value, dict):
         return {key: what for key, what in value.items() if key != "type"}
     return value
 
@@ -149,28 +120,16 @@ _WIDEST_RATIO = 2.0
 _ROOM = 0.25
 
 
-@dataclass(frozen=True)
-class Range:
-    """Range of an axis.
-
-    Attributes:
-        low: lower end.
-        high: upper end.
-        beyond: the value furthest outside and its time [s]; None if nothing is cut.
-    """
-
-    low: float
-    high: float
-    beyond: tuple[float, float] | None = None
-
-
-def usual_ends(values: pl.Series, *, exact: bool) -> list[float]:
+def usual_ends(values: pl.Series, *, exact: bool) -> tuple[float, float]:
     """Lower and upper end of a line: ``exact``, or without the most extreme 1 % of the values."""
-    shares = [0.0, 1.0] if exact else [_LONE_SHARE / 2.0, 1.0 - _LONE_SHARE / 2.0]
-    return [float(end) for end in np.quantile(values.to_numpy(), shares)]
+    share = 0.0 if exact else _LONE_SHARE / 2.0
+    low, high = np.quantile(values.to_numpy(), (share, 1.0 - share)).tolist()
+    return low, high
 
 
-def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
+def find_range(
+    lines: pl.DataFrame, usual: tuple[float, float]
+) -> tuple[float, float, tuple[float, float] | None]:
     """Axis range of lines over time: all values, or without isolated peaks that would flatten the rest.
 
     Args:
@@ -178,18 +137,19 @@ def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
         usual: range without isolated peaks.
 
     Returns:
-        The range including zero; peaks are cut if they would more than double it.
+        Both ends, which include zero; peaks are cut if they would more than double the range: then also the
+        value furthest outside and its time [s].
     """
     lines = lines.drop_nulls("value")
     values = lines["value"].to_numpy()
-    whole = Range(min(float(values.min()), 0.0), max(float(values.max()), 0.0))
+    lowest, highest = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
     low, high = min(usual[0], 0.0), max(usual[1], 0.0)
     room = _ROOM * (high - low)
-    if room == 0.0 or whole.high - whole.low <= _WIDEST_RATIO * (high - low):
-        return whole
-    low, high = max(low - room, whole.low), min(high + room, whole.high)
+    if room == 0.0 or highest - lowest <= _WIDEST_RATIO * (high - low):
+        return lowest, highest, None
+    low, high = max(low - room, lowest), min(high + room, highest)
     furthest = int(np.argmax(np.maximum(values - high, low - values)))
-    return Range(low, high, (float(values[furthest]), float(lines["t"][furthest])))
+    return low, high, (float(values[furthest]), float(lines["t"][furthest]))
 
 
 def round_up(value: float) -> float:
@@ -324,7 +284,7 @@ Columns = dict[str, object]
 
 def build_spec(drawing: Drawing) -> dict[str, object]:
     """Vega-Lite specification of a drawing in light colours, without its rows."""
-    return {"$schema": SCHEMA, **drawing.chart.to_dict(), "config": chart_config()}
+    return {"$schema": SCHEMA, **drawing.chart, "config": chart_config()}
 
 
 def fill_spec(drawing: Drawing) -> dict[str, object]:
@@ -336,31 +296,25 @@ def fill_spec(drawing: Drawing) -> dict[str, object]:
 
 
 def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:
-    """Rows of all drawings, each name once, as columns; texts are encoded as indices into a list of levels.
+    """Rows of all drawings, each name once, as `pack_rows` has them."""
+    return pack_rows({name: frame for drawing in drawings for name, frame in drawing.rows.items()})
+
+
+def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
+    """Rows by name as columns; texts are encoded as indices into a list of levels.
 
     Returns:
         By name, columns: a list of numbers, or ``{"levels": [...], "codes": [...]}`` for texts.
     """
-    frames: dict[str, pl.DataFrame] = {}
-    for drawing in drawings:
-        frames.update(drawing.rows)
-    return pack_rows(frames)
-
-
-def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
-    """Rows by name as columns, as from `share_rows`."""
-    return {name: _pack_columns(frame) for name, frame in sorted(frames.items())}
-
-
-def _pack_columns(frame: pl.DataFrame) -> Columns:
-    packed: Columns = {}
-    for column in _round_floats(frame).iter_columns():
-        if column.dtype == pl.String:
-            levels = column.unique(maintain_order=True)
-            codes = column.replace_strict(levels, list(range(levels.len())), return_dtype=pl.Int64)
-            packed[column.name] = {"levels": levels.to_list(), "codes": codes.to_list()}
-        else:
-            packed[column.name] = column.to_list()
+    packed: dict[str, Columns] = {}
+    for name, frame in sorted(frames.items()):
+        columns = packed[name] = {}
+        for column in _round_floats(frame).iter_columns():
+            columns[column.name] = column.to_list()
+            if column.dtype == pl.String:
+                levels = column.unique(maintain_order=True)
+                codes = column.replace_strict(levels, list(range(levels.len())), return_dtype=pl.Int64)
+                columns[column.name] = {"levels": levels.to_list(), "codes": codes.to_list()}
     return packed
 
 
@@ -373,7 +327,6 @@ def _round_floats(frame: pl.DataFrame) -> pl.DataFrame:
 # Bundling takes most of a second and always gives the same text, so it is cached in the user's cache folder.
 # A missing, damaged or read-only cache only costs that second.
 
-_DIGEST_LENGTH = 64
 _EXPOSE = "window.vegaEmbed = vegaEmbed;"
 
 
@@ -381,16 +334,19 @@ def load_bundle() -> str:
     """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
     require_package("vl_convert", "report", "a page with figures")
     path = cache_path()
-    cached = _read_checked(path)
-    if cached is not None:
-        return cached
+    with contextlib.suppress(OSError):
+        digest, _, body = path.read_bytes().partition(b"\n")
+        if hashlib.sha256(body).hexdigest().encode() == digest:
+            return body.decode()
     import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
 
+    script: str = vl_convert.javascript_bundle(_EXPOSE)
     # A closing tag inside a string literal would end the script element.
-    script: str = (
-        vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
-    )
-    _write_checked(path, script)
+    script = script.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    body = script.encode()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
     return script
 
 
@@ -408,9 +364,10 @@ def warm_bundle() -> None:
     if not can_draw():
         return
     path = cache_path()
-    if path.is_file() or not _can_write(path.parent):
-        return
-    threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.is_file() and os.access(path.parent, os.W_OK):
+        threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
 
 
 def _bundle_apart() -> None:
@@ -429,59 +386,6 @@ def cache_path() -> Path:
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
     return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
-
-
-def _read_checked(path: Path) -> str | None:
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    digest, _, script = content.partition(b"\n")
-    if len(digest) != _DIGEST_LENGTH or hashlib.sha256(script).hexdigest().encode() != digest:
-        return None
-    return script.decode()
-
-
-def _write_checked(path: Path, script: str) -> None:
-    body = script.encode()
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
-
-
-def _can_write(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
-
-
-MAP_WIDTH, MAP_LOWEST, MAP_HIGHEST = 480, 260, 420
-_MARGIN = 0.05
-_SMALLEST_SPAN_M = 1.0
-
-
-def fit_equal_aspect(
-    x: list[float], y: list[float], *, width: float = MAP_WIDTH
-) -> tuple[float, list[float], list[float]]:
-    """Height [px] and domains [m] that give x and y the same scale and contain both extents."""
-    wide, tall = x[1] - x[0], y[1] - y[0]
-    height = min(max(width * tall / wide, MAP_LOWEST), MAP_HIGHEST)
-    scale = max(wide / width, tall / height)
-    return round(height), _widen(x, scale * width), _widen(y, scale * height)
-
-
-def _widen(extent: list[float], span: float) -> list[float]:
-    middle = (extent[0] + extent[1]) / 2.0
-    return [middle - span / 2.0, middle + span / 2.0]
-
-
-def find_extent(values: pl.Series) -> list[float]:
-    """Limits of an axis that contains the values [m], with a margin."""
-    low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
-    span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
-    return [round(value, 4) for value in _widen([low, high], span)]
 
 
 @dataclass(frozen=True)

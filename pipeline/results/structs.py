@@ -573,7 +573,7 @@ def _round(value: object) -> object:
 
 
 def read_result(content: Mapping[str, object], kind: type[Result], where: Path = Path()) -> Result:
-    """A result from its JSON object, stored now or by an earlier version.
+    """A result from its JSON object.
 
     Args:
         content: the object.

@@ -267,12 +267,12 @@ def load_run(
         sha256: of the recording.
 
     Raises:
-        MotionError: ``not_aligned``, the tables are of an earlier version; ``no_poses``, fewer than ten poses
-            carry information.
+        MotionError: ``not_aligned``, there is no table `alignments`; ``no_poses``, fewer than ten poses carry
+            information.
     """
     table = tables.get("alignments")
     if table is None or table.is_empty():
-        what = "the results were made by an earlier version, before recordings were aligned"
+        what = "the results have no table alignments"
         raise MotionError("not_aligned", what, where=name, hint="Analyze the log again with --force.")
     return make_run(tables, vehicle, read_alignment(table), name=name, sha256=sha256)
 

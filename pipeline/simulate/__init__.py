@@ -15,16 +15,14 @@ from typing import Any, Final, TypedDict, TypeVar, Unpack, get_args
 import numpy as np
 
 from pipeline.core import Floats, Ints
-from pipeline.simulate import messages
 from pipeline.simulate.facts import (
     CATALOGUE,
     LAYOUTS,
     VEHICLES,
-    DriveTopic,
     EffectSpec,
+    Field,
     Layout,
     ParameterSpec,
-    PoseTopic,
     SimulateError,
     Vehicle,
     find_layout,
@@ -33,20 +31,18 @@ from pipeline.simulate.facts import (
     resolve_effects,
     unknown_name,
 )
-from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
+from pipeline.simulate.messages import list_topics, publish
 from pipeline.simulate.path import SLOPE_EFFECTS
 from pipeline.simulate.programs import read_played
+from pipeline.simulate.run import SimulatedRun, simulate_run
 from pipeline.simulate.scenario import (
-    INCIDENTS,
-    TRACTION,
     Clock,
     Disturbance,
     Drive,
     Encoders,
     Ground,
     Imu,
-    Incident,
-    IncidentKind,
+    Messages,
     PoseSensor,
     Program,
     ProgramName,
@@ -54,57 +50,7 @@ from pipeline.simulate.scenario import (
     Scenario,
     State,
 )
-from pipeline.simulate.topics import list_topics, publish
 
-Stamps = Ints
-
-_SWING_S = 7.0
-_SHORTEST_BUNCH = 0.1
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-
-
-def stamp_times(clock: Clock, time_s: Floats) -> Stamps:
-    """Nanoseconds that the recorder's clock shows when it gets what came at true times [s], shape (n,).
-
-    A clock that was set before the run began counts from its own time before the run, too: a pose that is
-    stamped early is a few moments older than the run. A clock that shows less than zero shows zero: stamps
-    are unsigned.
-    """
-    got = _bunch(time_s, clock.bunch_s)
-    if clock.real_time_factor is not None:
-        turn = 2.0 * np.pi / _SWING_S
-        passed = (got + clock.swing / turn * np.sin(turn * got)) / clock.real_time_factor
-        return clock.start_ns + np.rint(passed * 1e9).astype(np.int64)
-    return _show(clock, got)
-
-
-def stamp_headers(clock: Clock, time_s: Floats) -> Stamps:
-    """Nanoseconds that header stamps show: simulated time where there is one, else the robot's clock."""
-    if clock.real_time_factor is not None:
-        return np.maximum(np.rint(time_s * 1e9).astype(np.int64), 0)
-    return _show(clock, time_s * (1.0 + 1e-6 * clock.drift_ppm))
-
-
-def _show(clock: Clock, time_s: Floats) -> Stamps:
-    elapsed = np.rint(time_s * 1e9).astype(np.int64)
-    unset = (time_s < clock.unset_s) & (clock.unset_s > 0.0)
-    shown = np.where(unset, elapsed, clock.start_ns + elapsed)
-    gone_back = time_s >= clock.backward_at_s
-    shown = np.where(gone_back, shown - round(clock.backward_s * 1e9), shown)
-    return np.maximum(shown, 0)
-
-
-def _bunch(time_s: Floats, longest_s: float) -> Floats:
-    """When bunches arrive in which what came at these times is, the shortest a tenth of the longest."""
-    if longest_s <= 0.0 or time_s.size == 0:
-        return time_s
-    count = 2 + int((time_s.max() + longest_s) / (_SHORTEST_BUNCH * longest_s))
-    share = np.modf(np.arange(1, count) * _GOLDEN)[0]
-    ends = np.cumsum(longest_s * (_SHORTEST_BUNCH + (1.0 - _SHORTEST_BUNCH) * share))
-    return ends[np.searchsorted(ends, time_s)]
-
-
-_BOOTED_NS = 100_000_000_000
 _MARK = ("simulation", {"by": "slip simulate"})
 """Metadata record of every simulated log: it is never pooled with recordings."""
 
@@ -125,22 +71,15 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
 
     scenario = run.scenario
     layout = find_layout(scenario.recording.layout, scenario.vehicle)
-    tables = publish(run, layout.topics or list_topics(layout, scenario))
-    if not layout.topics:
-        tables += [*messages.state_tables(run), *messages.decoy_tables(run)]
+    tables = publish(run, list_topics(layout, scenario))
     with LogWriter(path) as writer:
-        for table in messages.cut_gaps(run, tables):
-            header = None if table.header_s is None else stamp_headers(scenario.clock, table.header_s)
-            if header is not None and table.topic in scenario.recording.zero_stamps:
-                header = np.zeros_like(header)
-            fields = table.fields
-            if header is not None and table.stamp != "header":
-                fields, header = fields | _write_stamp(table.stamp, header, scenario.clock.start_ns), None
+        for table in map(scenario.recording.lose, tables) if scenario.recording.lose else tables:
+            header = None if table.header_s is None else scenario.clock.stamp_headers(table.header_s)
             writer.write_columns(
                 table.topic,
                 table.type_name,
-                stamp_times(scenario.clock, table.log_s),
-                fields,
+                scenario.clock.stamp_log(table.log_s),
+                table.fields,
                 header_time=header,
             )
         if marked:
@@ -149,14 +88,6 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
             writer.metadata(
                 "deployment", {"vehicle": scenario.vehicle.name, "terrain": scenario.recording.terrain}
             )
-
-
-def _write_stamp(field: str, stamps: Ints, start_ns: int) -> dict[str, Field]:
-    """Fields of a stamp [ns] outside a header; a counter of microseconds began some time before the run."""
-    if field.startswith("timestamp"):
-        return {field: ((stamps - start_ns + _BOOTED_NS) // 1000).astype(np.float64)}
-    seconds, rest = np.divmod(stamps, 1_000_000_000)
-    return {f"{field}.sec": seconds.astype(np.float64), f"{field}.nanosec": rest.astype(np.float64)}
 
 
 Made = TypeVar("Made")
@@ -212,7 +143,6 @@ def _make_case(name: str, given: dict[str, Any]) -> Case:
 CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml").items())
 
 _BY_NAME = {case.name: case for case in CASES}
-_SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")
 _LESSON_HILLS = Ground(hill_m=0.5, hill_length_m=20.0)
 """Ground of a run that is asked for an effect of slopes: hills of up to a quarter of slope."""
 
@@ -356,13 +286,3 @@ def _fill_usual_sizes(
                 item.name: item.typical for item in known[name].parameters if not math.isnan(item.typical)
             }
     return filled
-
-
-def write_samples(directory: Path) -> list[Path]:
-    """Write the three sample logs into a folder, which is made if need be.
-
-    Returns:
-        The files written: ``husky_tile.mcap``, ``warthog_ice.mcap`` and ``ackermann_gravel.mcap``.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    return [simulate_case(name, out=directory / f"{name}.mcap") for name in _SAMPLES]

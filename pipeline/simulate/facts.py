@@ -3,15 +3,18 @@
 import math
 import tomllib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Literal, get_args
 
-import msgspec
 import numpy as np
 
 from pipeline.core import Floats, SlipError, guess_names
+
+Series = Mapping[str, Floats]
+"""Quantities of the run by name, shape (n,) each."""
+Field = Floats | float | str | list[str]
 
 
 @dataclass(frozen=True)
@@ -23,15 +26,15 @@ class Q:
     offset: float = 0.0
     whole: bool = False
 
+    def __call__(self, series: Series) -> Floats:
+        """Its values, shape (n,)."""
+        values = series[self.name]
+        if (self.gain, self.offset) != (1.0, 0.0):
+            values = self.gain * values + self.offset
+        return np.floor(values) if self.whole else values
 
-@dataclass(frozen=True)
-class Json:
-    """A text with a JSON object of quantities by key."""
 
-    numbers: Mapping[str, Q]
-
-
-Value = Q | Json | tuple[Q, ...] | str | list[str] | float
+Value = tuple[Q, ...] | Callable[[Series], Field] | str | list[str] | float
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,9 @@ class Published:
     Attributes:
         topic, type_name: where and what.
         source: whose times and quantities it has, an entry of `SOURCES`.
-        fields: by field path a quantity, several for an array, a text of them, or a constant.
+        fields: by field path a quantity, several for an array, what is made of some, or a constant.
         every: one message in so many is published.
-        stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
+        stamp: ``header``, or ``none``.
     """
 
     topic: str
@@ -135,12 +138,6 @@ class Vehicle:
     controller_track_multiplier: float = 1.0
     max_sideways_mps: float = 0.0
 
-    def __post_init__(self) -> None:
-        for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
-            if not getattr(self, name) > 0.0:
-                hint = f"Give {name} in SI units"
-                raise SimulateError("bad_vehicle", f"{name} must be above zero", where=self.name, hint=hint)
-
     @property
     def moves_sideways(self) -> bool:
         """Whether it can be asked to."""
@@ -174,12 +171,10 @@ def find_vehicle(name: str) -> Vehicle:
 # The formulas themselves stand where they act: ``drivetrain`` (command to wheels), ``body`` (wheels to body
 # velocity) and ``localization`` (what the pose reports). Signs follow REP-103: x forward, y left, z up.
 
-_INF = math.inf
-
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """One number of an effect: its unit, the value that changes nothing, and a usual one.
+    """One number of an effect: its unit, the value that changes nothing, a usual one, and the least possible.
 
     ``neutral`` is NaN for a parameter that only says where an effect acts and so cannot be neutral.
     """
@@ -188,6 +183,7 @@ class ParameterSpec:
     unit: str
     neutral: float
     typical: float
+    least: float = -math.inf
 
 
 @dataclass(frozen=True)
@@ -216,35 +212,36 @@ CATALOGUE: dict[str, EffectSpec] = {
 
 
 class Effects:
-    """The effects of one scenario with their values: complete, checked, and neutral where not asked for."""
+    """The effects of one scenario with their values, neutral where not asked for.
+
+    Attributes:
+        asked: what was asked for, by effect and parameter.
+        written: effects among them that are not in the catalogue.
+    """
 
     def __init__(
-        self, values: Mapping[str, Mapping[str, float]], written: tuple[EffectSpec, ...] = ()
+        self, asked: Mapping[str, Mapping[str, float]], written: tuple[EffectSpec, ...] = ()
     ) -> None:
-        self._values = {name: dict(numbers) for name, numbers in values.items()}
-        self.written = written
+        self.asked, self.written = asked, written
+        numbers = {
+            (spec.id, one): asked.get(spec.id, {}).get(one.name, one.neutral)
+            for spec in (*CATALOGUE.values(), *written)
+            for one in spec.parameters
+        }
+        self._numbers = {(effect, one.name): number for (effect, one), number in numbers.items()}
+        self._active = {
+            effect
+            for (effect, one), number in numbers.items()
+            if number != one.neutral and not math.isnan(one.neutral)
+        }
 
     def value(self, effect: str, parameter: str) -> float:
         """The value of a parameter; its neutral one when the effect was not asked for."""
-        given = self._values.get(effect, {})
-        if parameter in given:
-            return given[parameter]
-        known = CATALOGUE | {spec.id: spec for spec in self.written}
-        if effect not in known:
-            what = f"{effect} is not in pipeline/simulate/effects.toml"
-            raise KeyError(what)
-        return next(item.neutral for item in known[effect].parameters if item.name == parameter)
+        return self._numbers[effect, parameter]
 
     def is_active(self, effect: str) -> bool:
         """Whether any parameter of the effect differs from its neutral value."""
-        return any(
-            not math.isnan(item.neutral) and self.value(effect, item.name) != item.neutral
-            for item in CATALOGUE[effect].parameters
-        )
-
-    def as_mapping(self) -> dict[str, dict[str, float]]:
-        """The values that were asked for, by effect and parameter."""
-        return {name: dict(numbers) for name, numbers in self._values.items()}
+        return effect in self._active
 
 
 def resolve_effects(
@@ -275,45 +272,24 @@ def resolve_effects(
 
 
 def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> dict[str, float]:
-    names = [item.name for item in spec.parameters]
+    known = {item.name: item for item in spec.parameters}
     if not isinstance(given, Mapping):
-        if len(names) > 1:
+        if len(known) > 1:
             what = "one number is not enough for an effect with several parameters"
-            raise _refuse("parameter_needed", what, spec.id, f"Name them: {', '.join(names)}")
-        given = {names[0]: given}
+            raise _refuse("parameter_needed", what, spec.id, f"Name them: {', '.join(known)}")
+        given = dict.fromkeys(known, given)
     for name, value in given.items():
-        if name not in names:
-            known = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
+        if name not in known:
+            units = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
             what = f"{spec.id} has no parameter '{name}'"
-            raise _refuse("unknown_parameter", what, spec.id, f"Its parameters are {known}")
-        _check_value(spec.id, name, float(value))
+            raise _refuse("unknown_parameter", what, spec.id, f"Its parameters are {units}")
+        least = known[name].least
+        # Only what is without limit where it changes nothing may be infinite.
+        is_endless = math.isinf(value) and not math.isinf(known[name].neutral)
+        if math.isnan(value) or value < least or is_endless:
+            hint = f"Give a finite number{'' if least == -math.inf else f' of at least {least:g}'}"
+            raise _refuse("bad_value", f"{spec.id}.{name} = {float(value)} is not possible", spec.id, hint)
     return {name: float(value) for name, value in given.items()}
-
-
-_NEVER_NEGATIVE = {
-    *("limit", "threshold", "bound", "reset", "scrub", "drag", "creep"),
-    *("friction", "gyration"),
-}
-_UNBOUNDED = {"limit", "bound", "no_load", "friction"}
-_LEAST = {"no_load": 0.1}
-_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "contact_friction": 1.0}
-
-
-def _check_value(effect: str, name: str, value: float) -> None:
-    low = _LEAST.get(name, -_INF)
-    waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
-    if (
-        name in _NEVER_NEGATIVE
-        or name.startswith("tau")
-        or effect in {"steering_play", "steering_sensor_play"}
-        or waits
-    ):
-        low = 0.0
-    elif name == "k" and effect in _SCALES:
-        low = _SCALES[effect]
-    if math.isnan(value) or value < low or (math.isinf(value) and name not in _UNBOUNDED):
-        hint = f"Give a finite number{'' if low == -_INF else f' of at least {low:g}'}"
-        raise _refuse("bad_value", f"{effect}.{name} = {value} is not possible", effect, hint)
 
 
 def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
@@ -324,30 +300,6 @@ def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
 #
 # The names are those of the published recordings and of common robot configurations.
 
-DriveForm = Literal[
-    "joint_state", "float_sides", "twist", "twist_stamped", "ackermann", "float_speed_steering"
-]
-PoseContent = Literal["odometry", "pose_stamped", "pose_covariance", "tf"]
-
-
-@dataclass(frozen=True)
-class DriveTopic:
-    """Topics of a command or of measured wheels: one, or a pair (left, right) or (speed, steering).
-
-    No encoder reports twists.
-    """
-
-    form: DriveForm
-    topics: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class PoseTopic:
-    """Topic of the pose."""
-
-    form: PoseContent
-    topic: str
-
 
 @dataclass(frozen=True)
 class Layout:
@@ -355,30 +307,16 @@ class Layout:
 
     Attributes:
         kind: vehicles that have it.
-        commands: what was asked, possibly on several topics.
-        wheels: what the encoders measured; empty when the robot does not publish it.
-        pose: where the localization reports.
-        imu: topic of the inertial unit, empty when there is none.
-        joints: names of the wheel joints of JointState messages, with ``{}`` for ``front_left`` and the like.
-        topics: everything in the log of a platform; nothing else is written then.
+        topics: topics, or rows of them as `messages.read_topic` takes them.
     """
 
     kind: Kind
-    commands: tuple[DriveTopic, ...]
-    wheels: tuple[DriveTopic, ...]
-    pose: PoseTopic
-    imu: str = ""
-    joints: str = "{}_wheel"
-    topics: tuple[Published, ...] = ()
+    topics: tuple[Published | Mapping[str, Any], ...]
 
 
-def _read_layout(given: dict[str, Any]) -> Layout:
-    commands = msgspec.convert(given.pop("commands"), tuple[DriveTopic, ...])
-    wheels = msgspec.convert(given.pop("wheels", []), tuple[DriveTopic, ...])
-    return Layout(given.pop("kind"), commands, wheels, PoseTopic(**given.pop("pose")), **given)
-
-
-LAYOUTS: dict[str, Layout] = {name: _read_layout(given) for name, given in read_facts("layouts.toml").items()}
+LAYOUTS: dict[str, Layout] = {
+    name: Layout(given["kind"], tuple(given["topics"])) for name, given in read_facts("layouts.toml").items()
+}
 
 
 def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:

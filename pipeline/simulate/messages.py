@@ -1,394 +1,396 @@
-"""From a scenario to a simulated run with its incidents, and its messages: topic, type, times, fields."""
+"""Topics of a run: their messages, each field filled from a quantity of the run, and those of a layout.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+What says when and with which quantities a topic is sent is an entry of `SOURCES`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, euler_from_quaternions, quaternions_from_yaw
-from pipeline.simulate.drivetrain import apply_ideal_model, drive_wheels
+from pipeline.core import Floats, rigid
+from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.facts import (
-    Effects,
+    Field,
+    Layout,
+    Published,
+    Q,
+    Series,
     SimulateError,
+    Value,
     Vehicle,
-    find_layout,
-    open_stream,
-    resolve_effects,
-    spread_times,
 )
-from pipeline.simulate.path import BodyMotion, Path, integrate_path, move_body
-from pipeline.simulate.programs import make_commands, make_wishes, walk_in_plane
-from pipeline.simulate.scenario import Commands, Drive, Incident, IncidentKind, Scenario, integrate_cells
-from pipeline.simulate.sensors import ImuReadings, Poses, WheelReadings, read_encoders, read_imu, report_poses
+from pipeline.simulate.programs import make_wishes
+from pipeline.simulate.run import SimulatedRun, integrate_odometry
+from pipeline.simulate.scenario import Messages, Scenario
 
-_SETTLED_M = 1e-6
-"""Two passes over hills that are this close to each other are one."""
-_MOST_PASSES = 40
+Sampled = tuple[Floats, Floats, dict[str, Floats]]
+"""Stamps and times in the log [s], shape (n,), and quantities by name."""
 
-
-@dataclass(frozen=True)
-class Truth:
-    """What really happened; never written to a log.
-
-    Attributes:
-        commands: what the drive was really told, hand driving included.
-        drive: wheels and steering on the integration grid.
-        motion: velocities before slope and place acted.
-        path: true pose and body velocity.
-        effects: the effects that acted.
-    """
-
-    commands: Commands
-    drive: Drive
-    motion: BodyMotion
-    path: Path
-    effects: Effects
-
-
-@dataclass(frozen=True)
-class SimulatedRun:
-    """One run: its scenario, the truth, and what is recorded.
-
-    Attributes:
-        scenario: what was asked for.
-        truth: what happened.
-        commands: body commands as recorded.
-        poses: what the localization reported.
-        wheels: what the encoders reported, or None.
-        imu: what the inertial unit reported, or None.
-    """
-
-    scenario: Scenario
-    truth: Truth
-    commands: Commands
-    poses: Poses
-    wheels: WheelReadings | None
-    imu: ImuReadings | None
-
-
-def simulate_run(scenario: Scenario) -> SimulatedRun:
-    """Simulate a scenario; the same scenario gives the same arrays, bit for bit.
-
-    Raises:
-        SimulateError: an unknown effect, parameter or program, an impossible value, or a combination that
-            makes no sense.
-    """
-    effects = resolve_effects(scenario.effects, scenario.vehicle.kind, scenario.written)
-    truth = _drive(scenario, effects, None)
-    if effects.is_active("grade_load"):
-        truth = _carry_grade(scenario, effects, truth)
-    return record_truth(scenario, truth)
-
-
-def _carry_grade(scenario: Scenario, effects: Effects, truth: Truth) -> Truth:
-    """The run whose wheels bear the slope that they drive over, by Picard's iteration.
-
-    Raises:
-        SimulateError: ``bad_value``, a load so large that the run does not settle.
-    """
-    middles = (np.arange(truth.motion.v0.size) + 0.5) * scenario.step_s
-    for _ in range(_MOST_PASSES):
-        pitch = np.interp(middles, truth.path.time_s, euler_from_quaternions(truth.path.quaternion)[1])
-        before, truth = truth, _drive(scenario, effects, pitch)
-        if float(np.max(np.abs(truth.path.position - before.path.position))) < _SETTLED_M:
-            return truth
-    what = "the slope and the wheels' speed on it do not settle"
-    raise SimulateError("bad_value", what, where="grade_load", hint="Give a smaller load or a shorter run")
-
-
-def _drive(scenario: Scenario, effects: Effects, pitch: Floats | None) -> Truth:
-    """What happens where the body has a pitch [rad] in each cell, as far as the wheels feel it."""
-    vehicle, seed = scenario.vehicle, scenario.seed
-    commands, drive = ask_wheels(scenario, effects, scenario.step_s, pitch)
-    if scenario.machinery is not None:
-        drive = scenario.machinery(drive)
-    drive = brake_wheels(drive, scenario.incidents)
-    motion = move_body(
-        drive,
-        vehicle,
-        effects,
-        disturbance=scenario.disturbance,
-        ground_input=scenario.ground_input,
-        generator=open_stream(seed, "disturbance"),
-    )
-    motion = disturb_body(motion, scenario.incidents, vehicle, drive.step_s)
-    path = integrate_path(
-        motion,
-        drive,
-        effects,
-        ground=scenario.ground,
-        extra=scenario.extra,
-        start=scenario.start_pose,
-        generator=open_stream(seed, "hills"),
-    )
-    return Truth(commands, drive, motion, path, effects)
-
-
-def ask_wheels(
-    scenario: Scenario, effects: Effects, step_s: float, pitch: Floats | None = None
-) -> tuple[Commands, Drive]:
-    """The commands of a scenario, and what its drive makes of them in steps of so many seconds."""
-    vehicle, duration, hold_s = scenario.vehicle, scenario.duration_s, scenario.program.hold_s
-    commands = scenario.played or make_commands(
-        scenario.program, vehicle, duration_s=duration, generator=open_stream(scenario.seed, "program")
-    )
-    commands = send_commands(commands, scenario.incidents)
-    return commands, drive_wheels(
-        commands,
-        vehicle,
-        effects,
-        hold_s=hold_s,
-        step_s=step_s,
-        cell_count=round(duration / step_s),
-        pitch=pitch,
-    )
-
-
-def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
-    """Let the scenario's sensors look at what happened, whoever computed it.
-
-    Raises:
-        SimulateError: ``encoders_needed`` when the pose is wheel odometry and there are no encoders;
-            ``bad_value`` for another child frame in messages that cannot name it; a layout that is unknown
-            or does not fit.
-    """
-    _check_frame(scenario)
-    duration, seed = scenario.duration_s, scenario.seed
-    wheels = imu = None
-    if scenario.encoders is not None:
-        wheels = read_encoders(scenario.encoders, truth.drive, duration_s=duration, seed=seed)
-    if scenario.imu is not None:
-        imu = read_imu(scenario.imu, truth.path, duration_s=duration, seed=seed)
-    seen = truth.path
-    if scenario.pose.source == "wheels":
-        if wheels is None:
-            what = "a pose from wheels needs encoders"
-            hint = "Add encoders to the scenario or let the pose come from localization"
-            raise SimulateError("encoders_needed", what, where="pose.source", hint=hint)
-        seen = integrate_odometry(scenario.vehicle, wheels, start=scenario.start_pose)
-    poses = report_poses(scenario.pose, seen, truth.effects, duration_s=duration, seed=seed)
-    poses = freeze_poses(poses, scenario.incidents)
-    return SimulatedRun(scenario, truth, _as_recorded(scenario, truth.commands), poses, wheels, imu)
-
-
-def _check_frame(scenario: Scenario) -> None:
-    layout = find_layout(scenario.recording.layout, scenario.vehicle)
-    if scenario.pose.child_frame != "base_link" and layout.pose.form != "odometry":
-        what = f"a pose as {layout.pose.form} cannot be of {scenario.pose.child_frame}"
-        hint = "Choose a layout whose pose is an odometry message"
-        raise SimulateError("bad_value", what, where="pose.child_frame", hint=hint)
-
-
-def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[float, float, float]) -> Path:
-    """Wheel odometry: the ideal model of the encoders, each reading held until the next."""
-    time = wheels.time_s
-    step = float(np.median(np.diff(time)))
-    speed, rate = apply_ideal_model(vehicle, wheels.left, wheels.right, wheels.steering)
-    aside = wheels.sideways_mps(vehicle)
-    heading = start[2] + integrate_cells(rate, step_s=step)
-    position = np.array([*start[:2], 0.0]) + walk_in_plane(speed, aside, heading, step_s=step)
-    edges = np.append(time, time[-1] + step)
-    velocity = np.stack((speed, aside, rate), axis=1)
-    return Path(edges, position, quaternions_from_yaw(heading), velocity)
-
-
-def _as_recorded(scenario: Scenario, commands: Commands) -> Commands:
-    commands = record_commands(commands, scenario.incidents)
-    by_hand = scenario.recording.hand_driven_s
-    if by_hand is None:
-        return commands
-    # The command topic keeps repeating zeros while a person drives by radio, past the computer.
-    live = commands.time_s >= by_hand
-    sideways = None if commands.sideways_mps is None else commands.sideways_mps * live
-    return Commands(commands.time_s, commands.speed_mps * live, commands.turn * live, sideways)
-
-
-Field = Floats | float | str | list[str]
+Reading = TypeVar("Reading")
 
 LATE_S = 0.002
 """From a reading to the recorder [s]."""
+_TF_PERIOD_S, _FUTURE_S = 0.05, 0.1
+_TURN = 2.0 * np.pi
+_COMPASS_OFF_RAD = 0.7
+"""An attitude is seldom against the true north."""
+_ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-@dataclass(frozen=True)
-class Messages:
-    """Messages of one topic, in true seconds.
+def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Messages]:
+    """Messages of every topic.
 
-    Attributes:
-        topic, type_name: where and what.
-        log_s: when the recorder got them, shape (n,).
-        header_s: what their headers say, shape (n,), or None for a type without header.
-        fields: values by field path; an array has one row a message.
-        stamp: where the stamp stands: ``header``, or a field, microseconds if it begins with ``timestamp``.
+    Raises:
+        SimulateError: ``encoders_needed``, a topic needs wheels or a gyro that the scenario leaves out.
     """
+    known: dict[str, Sampled] = {}
+    tables = []
+    for one in topics:
+        if one.source not in known:
+            known[one.source] = SOURCES[one.source](run)
+        stamp, log, series = known[one.source]
+        rows = slice(None, None, one.every)
+        taken = {"stamp": stamp[rows]} | {name: values[rows] for name, values in series.items()}
+        fields = {path: _fill(value, taken) for path, value in one.fields.items()}
+        header = None if one.stamp == "none" else stamp[rows]
+        tables.append(Messages(one.topic, one.type_name, log[rows], header, fields))
+    return tables
 
-    topic: str
-    type_name: str
-    log_s: Floats
-    header_s: Floats | None
-    fields: dict[str, Field]
-    stamp: str = "header"
+
+def _fill(value: Value, series: Series) -> Field:
+    if isinstance(value, tuple):
+        return np.stack([each(series) for each in value], axis=1)
+    return value(series) if callable(value) else value
 
 
-def state_tables(run: SimulatedRun) -> list[Messages]:
-    """Messages that say which part of the run counts, if a person drives first."""
-    by_hand = run.scenario.recording.hand_driven_s
-    if by_hand is None:
-        return []
+def _of_command(run: SimulatedRun) -> Sampled:
+    commands, vehicle, recording = run.commands, run.scenario.vehicle, run.scenario.recording
+    turned = recording.command_scale if recording.command_turn_scale is None else recording.command_turn_scale
+    left, right = invert_ideal_model(
+        vehicle, recording.command_scale * commands.speed_mps, turned * commands.turn
+    )
+    series = {
+        "speed": commands.speed_mps,
+        "yaw_rate": commands.yaw_rate(vehicle),
+        "steering": commands.turn,
+        "left": left,
+        "right": right,
+        "sideways": commands.sideways,
+    }
+    return commands.time_s, commands.time_s + recording.command_latency_s, series
+
+
+def read_wheels(run: SimulatedRun) -> Sampled:
+    """When and what the encoders say."""
+    wheels = need(run.wheels, "encoders")
+    speed, rate = apply_ideal_model(run.scenario.vehicle, wheels.left, wheels.right, wheels.steering)
+    series = {
+        name: getattr(wheels, name) for name in ("left", "right", "left_angle", "right_angle", "steering")
+    }
+    series |= {"speed": speed, "yaw_rate": rate, "zero": np.zeros_like(speed)}
+    series["sideways"] = wheels.sideways_mps(run.scenario.vehicle)
+    series |= dict(wheels.corners or {})
+    series |= {f"{corner}_angle": angle for corner, angle in (wheels.corner_angles or {}).items()}
+    series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
+    if run.imu is not None:
+        # Where one message holds both.
+        for name, values in (("rate", run.imu.rates), ("force", run.imu.accelerations)):
+            for i, axis in enumerate("xyz"):
+                series[f"{name}_{axis}"] = np.interp(wheels.time_s, run.imu.time_s, values[:, i])
+    return wheels.time_s, wheels.time_s + LATE_S, series
+
+
+def _of_localization(run: SimulatedRun) -> Sampled:
+    position, quaternion = run.poses.in_map()
+    if not run.scenario.pose.reports_heading:
+        quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (quaternion.shape[0], 1))
+    ned = rigid.multiply_quaternions(
+        np.broadcast_to(_ENU_IN_NED, quaternion.shape),
+        rigid.multiply_quaternions(quaternion, np.broadcast_to(_FRD_IN_FLU, quaternion.shape)),
+    )
+    series = name_pose(position, quaternion) | {f"ned_q{axis}": ned[:, i] for i, axis in enumerate("xyzw")}
+    return run.poses.stamp_s, run.poses.log_s, series
+
+
+def _of_tracking(run: SimulatedRun) -> Sampled:
+    return run.poses.stamp_s, run.poses.log_s, name_pose(run.poses.position, run.poses.quaternion)
+
+
+def _of_relocalization(run: SimulatedRun) -> Sampled:
+    """Localization corrects at its own pace and dates its transform ahead, so that others can look it up."""
+    time = np.arange(0.0, run.scenario.duration_s, _TF_PERIOD_S)
+    which = np.clip(np.searchsorted(run.poses.log_s, time, side="right") - 1, 0, None)
+    turn = rigid.quaternions_from_yaw(run.poses.correction_yaw[which])
+    return time + _FUTURE_S, time + LATE_S, name_pose(run.poses.correction[which], turn)
+
+
+def _of_imu(run: SimulatedRun) -> Sampled:
+    imu, path = need(run.imu, "an inertial unit"), run.truth.path
+    series = {f"rate_{axis}": imu.rates[:, i] for i, axis in enumerate("xyz")}
+    series |= {f"force_{axis}": imu.accelerations[:, i] for i, axis in enumerate("xyz")}
+    _, turn = rigid.interpolate_poses(imu.time_s, path.time_s, path.position, path.quaternion)
+    start = np.broadcast_to(rigid.quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
+    turn = rigid.multiply_quaternions(start, turn)
+    series |= {f"attitude_{axis}": turn[:, i] for i, axis in enumerate("xyzw")}
+    return imu.time_s, imu.time_s + LATE_S, series
+
+
+def _of_decoy(run: SimulatedRun) -> Sampled:
+    """Commands that never reach the controller."""
+    wished = make_wishes(run.scenario, "decoy")
+    series = {"speed": wished.speed_mps, "yaw_rate": wished.turn, "sideways": wished.sideways}
+    return wished.time_s, wished.time_s, series
+
+
+def of_odometry(run: SimulatedRun) -> Sampled:
+    """Where the wheels alone say that the vehicle is."""
+    stamp, log, series = read_wheels(run)
+    path = integrate_odometry(run.scenario.vehicle, need(run.wheels, "encoders"), start=(0.0, 0.0, 0.0))
+    return stamp, log, series | name_pose(path.position[:-1], path.quaternion[:-1])
+
+
+def _of_state(run: SimulatedRun) -> Sampled:
+    """Which part of the run counts, if a person drives first."""
     time = np.arange(0.0, run.scenario.duration_s, 0.1)
-    topic, name = "/drive/calib_state", "std_msgs/msg/String"
-    return [
-        Messages(topic, name, time[time < by_hand], None, {"data": "idle"}),
-        Messages(topic, name, time[time >= by_hand], None, {"data": "calib"}),
-    ]
+    return time, time, {"counts": (time >= (run.scenario.recording.hand_driven_s or 0.0)).astype(np.float64)}
 
 
-def decoy_tables(run: SimulatedRun) -> list[Messages]:
-    """Messages that a hasty reader takes for the pose or the command."""
-    scenario = run.scenario
-    tables: list[Messages] = []
-    if scenario.recording.decoys in {"commands", "both"}:
-        wished = make_wishes(scenario, "decoy")
-        fields: dict[str, Field] = {"linear.x": wished.speed_mps, "angular.z": wished.turn}
-        tables.append(Messages("/navigation/cmd_vel", "geometry_msgs/msg/Twist", wished.time_s, None, fields))
-    if scenario.recording.decoys in {"odometry", "both"} and run.wheels is not None:
-        wheels = run.wheels
-        path = integrate_odometry(scenario.vehicle, wheels, start=(0.0, 0.0, 0.0))
-        speed, rate = apply_ideal_model(scenario.vehicle, wheels.left, wheels.right, wheels.steering)
-        fields = {f"pose.pose.position.{axis}": path.position[:-1, i] for i, axis in enumerate("xyz")}
-        fields |= {f"pose.pose.orientation.{axis}": path.quaternion[:-1, i] for i, axis in enumerate("xyzw")}
-        fields |= {"header.frame_id": "odom", "child_frame_id": "base_link"}
-        fields |= {"twist.twist.linear.x": speed, "twist.twist.angular.z": rate}
-        time = wheels.time_s
-        tables.append(Messages("/platform/odom", "nav_msgs/msg/Odometry", time + LATE_S, time, fields))
-    return tables
+def _once(run: SimulatedRun) -> Sampled:
+    del run
+    return np.zeros(1), np.zeros(1), {}
 
 
-def cut_gaps(run: SimulatedRun, tables: list[Messages]) -> list[Messages]:
-    """Take out what the recorder missed, on every topic alike."""
-    recording = run.scenario.recording
-    starts = spread_times(
-        recording.gaps,
-        duration_s=run.scenario.duration_s,
-        generator=open_stream(run.scenario.seed, "gaps"),
+def name_pose(position: Floats, quaternion: Floats) -> dict[str, Floats]:
+    """Quantities of poses."""
+    named = {axis: position[:, i] for i, axis in enumerate("xyz")}
+    return named | {f"q{axis}": quaternion[:, i] for i, axis in enumerate("xyzw")}
+
+
+def need(reading: Reading | None, what: str) -> Reading:
+    """What a sensor read.
+
+    Raises:
+        SimulateError: ``encoders_needed``, the scenario leaves it out.
+    """
+    if reading is None:
+        raise SimulateError(
+            "encoders_needed",
+            f"the layout has {what}, and the scenario has none",
+            where="layout",
+            hint="Choose a case with encoders and an inertial unit",
+        )
+    return reading
+
+
+SOURCES: dict[str, Callable[[SimulatedRun], Sampled]] = {
+    "command": _of_command,
+    "wheels": read_wheels,
+    "localization": _of_localization,
+    "tracking": _of_tracking,
+    "relocalization": _of_relocalization,
+    "imu": _of_imu,
+    "decoy": _of_decoy,
+    "odometry": of_odometry,
+    "state": _of_state,
+    "once": _once,
+}
+
+_XYZ, _XYZW = "xyz", "xyzw"
+
+Fields = dict[str, Value]
+
+
+_TWIST = {"linear.x": "speed", "linear.y": "sideways", "angular.z": "yaw_rate"}
+
+
+def pose_fields(position: str, orientation: str) -> dict[str, Q]:
+    """Fields of a pose."""
+    fields = {f"{position}.{axis}": Q(axis) for axis in _XYZ}
+    return fields | {f"{orientation}.{axis}": Q(f"q{axis}") for axis in _XYZW}
+
+
+_POSE_IN_POSE = pose_fields("pose.pose.position", "pose.pose.orientation")
+
+
+def twist(
+    topic: str, *, stamped: bool = False, source: str = "command", frame: str | None = None
+) -> Published:
+    """A body command; a ``wish`` is one that never reaches the controller."""
+    prefix, name, stamp = ("twist.", "TwistStamped", "header") if stamped else ("", "Twist", "none")
+    fields: Fields = {f"{prefix}{path}": Q(name) for path, name in _TWIST.items()}
+    if frame is not None:
+        fields["header.frame_id"] = frame
+    return Published(topic, f"geometry_msgs/msg/{name}", source, fields, stamp=stamp)
+
+
+def odometry(topic: str, source: str, parent: str, child: str) -> Published:
+    """An odometry; one of the wheels says their speed as well."""
+    fields: Fields = {**_POSE_IN_POSE, "header.frame_id": parent, "child_frame_id": child}
+    if source != "localization":
+        fields |= {f"twist.twist.{path}": Q(name) for path, name in _TWIST.items()}
+    return Published(topic, "nav_msgs/msg/Odometry", source, fields)
+
+
+def transform(topic: str, source: str, parent: str, child: str) -> Published:
+    """A moving transform."""
+    inner = "transforms[].transform."
+    fields: Fields = {
+        **pose_fields(f"{inner}translation", f"{inner}rotation"),
+        "transforms[].header.frame_id": parent,
+        "transforms[].child_frame_id": child,
+    }
+    return Published(topic, "tf2_msgs/msg/TFMessage", source, fields)
+
+
+def mount(child: str, position: Sequence[float] = (0.0, 0.0, 0.0), yaw: float = 0.0) -> Published:
+    """Where a sensor is on the vehicle."""
+    made = transform("/tf_static", "once", "base_link", child)
+    series = name_pose(np.array([position]), rigid.quaternions_from_yaw(np.array([yaw])))
+    known = {path: float(one(series)[0]) for path, one in made.fields.items() if isinstance(one, Q)}
+    return replace(made, fields={**made.fields, **known})
+
+
+def joints(
+    topic: str,
+    template: str = "{}_wheel",
+    places: Sequence[str] = (),
+    fields: str = "both",
+    source: str = "wheels",
+    *,
+    each: bool = False,
+) -> Published:
+    """Joint states of the wheels.
+
+    Args:
+        topic: where.
+        template: names of the joints, with ``{}`` for a place.
+        places: ``front_left`` and the like, ``steer_front_left`` of a joint that steers.
+        fields: ``position`` or ``velocity`` alone, or both.
+        source: of their motion.
+        each: whether wheels of a side differ, as on a vehicle that moves sideways.
+    """
+    named = {place: place if each else place.rsplit("_", 1)[-1] for place in places}
+    steers = [place.startswith("steer") for place in places]
+    turned = tuple(Q("steering" if s else f"{named[p]}_angle") for p, s in zip(places, steers, strict=True))
+    rolling = tuple(Q("zero" if s else named[p]) for p, s in zip(places, steers, strict=True))
+    values: Fields = {"name": [name_joint(template, place) for place in places]}
+    values |= {"position": turned} if fields != "velocity" else {}
+    values |= {"velocity": rolling} if fields != "position" else {}
+    return Published(topic, "sensor_msgs/msg/JointState", source, values)
+
+
+def name_joint(template: str, corner: str) -> str:
+    """Name of the wheel joint of a place, or of its steering joint."""
+    name = template.format(corner.removeprefix("steer_"))
+    return name.replace("wheel", "steering") if corner.startswith("steer") else name
+
+
+def imu(topic: str, *, attitude: bool = False, is_unknown: bool = False) -> Published:
+    """An inertial unit, perhaps with an attitude, or one that says that it has none."""
+    fields: Fields = {"header.frame_id": "imu_link", "orientation.w": 1.0}
+    if is_unknown:
+        nothing = Q("rate_x", 0.0, 0.0)
+        fields["orientation_covariance"] = (replace(nothing, offset=-1.0), *[nothing] * 8)
+    if attitude:
+        fields |= {f"orientation.{axis}": Q(f"attitude_{axis}") for axis in _XYZW}
+    fields |= {f"angular_velocity.{axis}": Q(f"rate_{axis}") for axis in _XYZ}
+    fields |= {f"linear_acceleration.{axis}": Q(f"force_{axis}") for axis in _XYZ}
+    return Published(topic, "sensor_msgs/msg/Imu", "imu", fields)
+
+
+def pose_stamped(topic: str) -> Published:
+    """A localization that says nothing of its errors."""
+    fields: Fields = {**pose_fields("pose.position", "pose.orientation"), "header.frame_id": "map"}
+    return Published(topic, "geometry_msgs/msg/PoseStamped", "localization", fields)
+
+
+def pose_with_covariance(topic: str, every: int = 1) -> Published:
+    """A localization, perhaps a slow one."""
+    fields: Fields = {**_POSE_IN_POSE, "header.frame_id": "map"}
+    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    return Published(topic, kind, "localization", fields, every=every)
+
+
+def number(topic: str, source: str, quantity: str) -> Published:
+    """One quantity alone."""
+    return Published(topic, "std_msgs/msg/Float64", source, {"data": Q(quantity)}, stamp="none")
+
+
+FORMS: dict[str, Callable[..., Published]] = {
+    made.__name__: made
+    for made in (
+        *(twist, odometry, transform, mount, joints),
+        *(imu, pose_stamped, pose_with_covariance, number),
     )
-    for start in starts.tolist():
-        tables = [_cut_out(table, start, start + recording.gap_s) for table in tables]
-    return tables
+}
+"""What a row of a layout may be, by the key with its topic."""
 
 
-def _cut_out(table: Messages, start_s: float, end_s: float) -> Messages:
-    mask = (table.log_s < start_s) | (table.log_s >= end_s)
-    return replace(
-        table,
-        log_s=table.log_s[mask],
-        header_s=None if table.header_s is None else table.header_s[mask],
-        fields={
-            path: value[mask] if isinstance(value, np.ndarray) else value
-            for path, value in table.fields.items()
-        },
-    )
+def read_topic(row: Mapping[str, Any]) -> Published:
+    """The topic of a row: one of `FORMS` with what it takes, or type, source, constants and quantities."""
+    given = dict(row)
+    for name in FORMS.keys() & row:
+        return FORMS[name](given.pop(name), **given)
+    fields: Fields = given.pop("constants", {})
+    fields = fields | {path: _read_value(one) for path, one in given.pop("quantities", {}).items()}
+    return Published(given.pop("topic"), given.pop("type"), given.pop("source"), fields, **given)
 
 
-# Incidents of a simulated drive: signals that drop, repeat or stop, and a body that is stuck or pushed.
+def _read_value(given: Any) -> Q | tuple[Q, ...]:  # noqa: ANN401 - as a file has it
+    """A quantity by its name, perhaps with a gain; or several."""
+    if isinstance(given, list):
+        return tuple(Q(one) if isinstance(one, str) else Q(**one) for one in given)
+    return Q(given) if isinstance(given, str) else Q(**given)
 
 
-def _mark(incidents: Sequence[Incident], kinds: Sequence[IncidentKind], times: Floats) -> Flags:
-    marked = np.zeros(times.size, dtype=bool)
-    for incident in incidents:
-        if incident.kind in kinds:
-            marked |= incident.contains(times)
-    return marked
-
-
-def send_commands(commands: Commands, incidents: Sequence[Incident]) -> Commands:
-    """The commands that the drive hears."""
-    return _drop(
-        _silence(commands, _mark(incidents, ("pushed",), commands.time_s)),
-        _mark(incidents, ("commands_silent",), commands.time_s),
-    )
-
-
-def record_commands(commands: Commands, incidents: Sequence[Incident]) -> Commands:
-    """Of the commands that the drive heard, those that the command topic holds."""
-    return _silence(commands, _mark(incidents, ("manual_driving",), commands.time_s))
-
-
-def _silence(commands: Commands, zero: Flags) -> Commands:
-    sideways = None if commands.sideways_mps is None else commands.sideways_mps * ~zero
-    speed, turn = commands.speed_mps * ~zero, commands.turn * ~zero
-    return replace(commands, speed_mps=speed, turn=turn, sideways_mps=sideways)
-
-
-def _drop(commands: Commands, gone: Flags) -> Commands:
-    sideways = None if commands.sideways_mps is None else commands.sideways_mps[~gone]
-    time, speed, turn = commands.time_s[~gone], commands.speed_mps[~gone], commands.turn[~gone]
-    return replace(commands, time_s=time, speed_mps=speed, turn=turn, sideways_mps=sideways)
-
-
-def _find_middles(cell_count: int, step_s: float) -> Floats:
-    return np.asarray((np.arange(cell_count) + 0.5) * step_s, dtype=np.float64)
-
-
-def brake_wheels(drive: Drive, incidents: Sequence[Incident]) -> Drive:
-    """The drive under emergency stops."""
-    times = _find_middles(drive.left.size, drive.step_s)
-    share = np.ones(times.size)
-    for incident in incidents:
-        if incident.kind in {"emergency_stop", "sliding"}:
-            ends = [
-                incident.start_s,
-                incident.start_s + _STOPS_IN_S,
-                incident.end_s,
-                incident.end_s + _STARTS_IN_S,
-            ]
-            share *= np.interp(times, ends, [1.0, 0.0, 0.0, 1.0])
-    corners = drive.corners
-    if corners is not None:
-        corners = {corner: wheel * share for corner, wheel in corners.items()}
-    return replace(drive, left=drive.left * share, right=drive.right * share, corners=corners)
-
-
-def disturb_body(
-    motion: BodyMotion, incidents: Sequence[Incident], vehicle: Vehicle, step_s: float
-) -> BodyMotion:
-    """The body's motion where it is stuck or pushed."""
-    times = _find_middles(motion.v0.size, step_s)
-    velocity = motion.velocity * ~_mark(incidents, ("stuck",), times)[:, None]
-    for incident in incidents:
-        inside = incident.contains(times)
-        if not inside.any():
+def list_topics(layout: Layout, scenario: Scenario) -> tuple[Published, ...]:
+    """Topics of a log in a layout, without those whose sensor the scenario leaves out."""
+    sensor, recording = scenario.pose, scenario.recording
+    missing = set() if scenario.encoders is not None else {"wheels", "odometry"}
+    missing |= set() if scenario.imu is not None else {"imu"}
+    topics: list[Published] = []
+    for row in layout.topics:
+        if isinstance(row, Published):
+            topics.append(row)
             continue
-        passed = (times[inside] - incident.start_s) / (incident.end_s - incident.start_s)
-        if incident.kind == "digging_in":
-            velocity[inside] *= np.maximum(1.0 - 2.0 * passed, 0.0)[:, None]
-        elif incident.kind == "spinning":
-            velocity[inside] *= _SPIN_SHARE
-        elif incident.kind == "sliding":
-            velocity[inside] = velocity[max(int(np.argmax(inside)) - 1, 0)] * (1.0 - passed)[:, None]
-    pushed = _mark(incidents, ("pushed",), times)
-    velocity[pushed, 0] += _PUSH_SHARE * min(vehicle.max_speed_mps, 1.0)
-    return replace(motion, velocity=velocity)
+        if "mount" not in row or scenario.imu is not None:
+            topics.append(read_topic(_fit_row(row, scenario)))
+        if "odometry" in row and sensor.child_frame != "base_link":
+            position = (sensor.mount_x_m, sensor.mount_y_m, 0.0)
+            topics.append(mount(sensor.child_frame, position, sensor.mount_yaw_rad))
+    if recording.hand_driven_s is not None:
+        fields: Fields = {"data": lambda series: np.where(series["counts"], "calib", "idle").tolist()}
+        topics.append(Published("/drive/calib_state", "std_msgs/msg/String", "state", fields, stamp="none"))
+    if recording.decoys in {"commands", "both"}:
+        topics.append(twist("/navigation/cmd_vel", source="decoy"))
+    if recording.decoys in {"odometry", "both"}:
+        topics.append(odometry("/platform/odom", "odometry", "odom", "base_link"))
+    return tuple(one for one in topics if one.source not in missing)
 
 
-def freeze_poses(poses: Poses, incidents: Sequence[Incident]) -> Poses:
-    """The poses of a localization that repeats the last one."""
-    rows = np.arange(poses.stamp_s.size)
-    for incident in incidents:
-        if incident.kind == "localization_frozen":
-            inside = incident.contains(poses.sampled_s)
-            rows[inside] = max(int(np.searchsorted(poses.sampled_s, incident.start_s)) - 1, 0)
-    return replace(poses, position=poses.position[rows], quaternion=poses.quaternion[rows])
+def _fit_row(row: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    """A row with what a vehicle and its sensors decide: joints, and the frame of the pose."""
+    vehicle = scenario.vehicle
+    if "odometry" in row:
+        return {**row, "child": scenario.pose.child_frame}
+    if "joints" not in row:
+        return dict(row)
+    places = _list_places(vehicle)
+    if row.get("source") == "command":
+        # A command lists the rear wheels first and an encoder the front ones: only names can tell them apart.
+        return {**row, "places": places[::-1], "fields": "velocity"}
+    report = "both" if scenario.encoders is None else scenario.encoders.report
+    fields = "both" if vehicle.kind == "ackermann" and report == "velocity" else report
+    return {**row, "places": places, "fields": fields, "each": vehicle.moves_sideways}
 
 
-_STOPS_IN_S = 0.15
-
-
-_STARTS_IN_S = 0.2
-
-
-_PUSH_SHARE = 0.5
-"""Of the vehicle's largest speed, at which it is pushed."""
-
-
-_SPIN_SHARE = 0.25
-"""Of the wheels' motion, that spinning ones bring."""
+def _list_places(vehicle: Vehicle) -> list[str]:
+    """Places of the joints of a vehicle."""
+    if vehicle.kind == "ackermann":
+        return ["rear_left", "rear_right", "steer_front_left", "steer_front_right"]
+    several = [f"axle_{number}_" for number in range(1, vehicle.wheels_per_side + 1)]
+    axles = {1: [""], 2: ["front_", "rear_"]}.get(vehicle.wheels_per_side, several)
+    return [f"{axle}{side}" for axle in axles for side in ("left", "right")]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -17,27 +16,19 @@ from pipeline.core import (
 from pipeline.simulate.drivetrain import TURNING_MPS, move_by_corners, steer_tyres
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle
 from pipeline.simulate.programs import filter_pole, lag_signal, make_coloured_noise, walk_in_plane
-from pipeline.simulate.scenario import Disturbance, Drive, ExtraPhysics, Ground, State, integrate_cells
+from pipeline.simulate.scenario import (
+    BodyMotion,
+    Disturbance,
+    Drive,
+    ExtraPhysics,
+    Ground,
+    State,
+    integrate_cells,
+)
 
 # From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
 #
 # What depends on the place or the slope is added while the pose is integrated.
-
-
-@dataclass(frozen=True)
-class BodyMotion:
-    """Velocities on the drive's cells.
-
-    Attributes:
-        v0, w0: body velocity before ground effects [m/s], [rad/s], shape (n,).
-        velocity: (v_x, v_y, v_w) so far [m/s, m/s, rad/s], shape (n, 3).
-        turning: one where the wheels turn, else zero, shape (n,).
-    """
-
-    v0: Floats
-    w0: Floats
-    velocity: Floats
-    turning: Floats
 
 
 def move_body(
@@ -46,7 +37,6 @@ def move_body(
     effects: Effects,
     *,
     disturbance: Disturbance,
-    ground_input: Literal["drive", "inertia"],
     generator: np.random.Generator,
 ) -> BodyMotion:
     """Body velocity of the drive's wheels.
@@ -56,7 +46,6 @@ def move_body(
         vehicle: geometry.
         effects: which effects act.
         disturbance: random true motion, on top.
-        ground_input: what ground effects act on.
         generator: source of the disturbance.
     """
     v0, s0, w0 = _roll_wheels(drive, vehicle, effects)
@@ -72,8 +61,7 @@ def move_body(
     if effects.is_active("contact_friction"):
         v_x, v_y, v_w = _slide_on_contacts(v0, w0, vehicle.track_width_m, effects, drive.step_s)
     # Friction in contact contains the ratio of yaw rates, as the track does.
-    is_drive = ground_input == "drive" and not effects.is_active("contact_friction")
-    along, aside, yaw_rate = (v0, s0, w0) if is_drive else (v_x, v_y, v_w)
+    along, aside, yaw_rate = (v_x, v_y, v_w) if effects.is_active("contact_friction") else (v0, s0, w0)
     v_x = (
         v_x
         - effects.value("speed_slip", "k") * along * np.abs(along)
@@ -250,8 +238,14 @@ class Path:
 
 Vector = tuple[float, float, float]
 
-SLOPE_EFFECTS = ("slope_slip", "slope_creep", "side_slope_slip", "side_slope_creep", "side_slope_turn")
-"""Effects by which gravity moves the body on a slope."""
+SLOPE_EFFECTS = {
+    "slope_slip": "k",
+    "slope_creep": "c",
+    "side_slope_slip": "k",
+    "side_slope_creep": "c",
+    "side_slope_turn": "k",
+}
+"""Effects by which gravity moves the body on a slope, with their parameters."""
 _WAVES = 6
 
 
@@ -343,47 +337,79 @@ def _cross_plane(
 
 
 class _Walk:
-    """Velocities and wheels averaged onto the slower grid of the step-by-step integration."""
+    """Velocities and wheels averaged onto a slower grid, and what depends on where the body is.
+
+    That is the slope, a terrain's border, odd physics.
+    """
 
     def __init__(
         self, motion: BodyMotion, drive: Drive, effects: Effects, extra: ExtraPhysics | None
     ) -> None:
-        self.stride = max(round(_SLOW_STEP_S / drive.step_s), 1)
-        self.cell_count = motion.v0.size // self.stride
-        self.step_s = self.stride * drive.step_s
-        self.effects = effects
-        self.extra = extra
-        self.velocity = np.stack([self._average(column) for column in motion.velocity.T], axis=1)
-        self.v0, self.w0 = self._average(motion.v0), self._average(motion.w0)
-        self.turning = self._average(motion.turning)
-        self.left, self.right = self._average(drive.left), self._average(drive.right)
-        self.steering = self._average(drive.steering)
-        self.left_angle, self.right_angle = (angle[:: self.stride] for angle in drive.wheel_angles())
+        stride = max(round(_SLOW_STEP_S / drive.step_s), 1)
+        count = motion.v0.size // stride
 
-    def _average(self, signal: Floats) -> Floats:
-        whole = signal[: self.cell_count * self.stride].reshape(self.cell_count, self.stride)
-        means: Floats = whole.mean(axis=1)
-        return means
+        def average(signal: Floats) -> Floats:
+            means: Floats = signal[: count * stride].reshape(count, stride).mean(axis=1)
+            return means
+
+        self.step_s = stride * drive.step_s
+        self.velocity = np.stack([average(column) for column in motion.velocity.T], axis=1)
+        signals = {"v0": motion.v0, "w0": motion.w0, "left_speed": drive.left, "right_speed": drive.right}
+        signals |= {"steering": drive.steering, "turning": motion.turning}
+        turned = zip(("left_angle", "right_angle"), drive.wheel_angles(), strict=True)
+        self._signals = {name: average(signal).tolist() for name, signal in signals.items()}
+        self._signals |= {name: angle[: count * stride : stride].tolist() for name, angle in turned}
+        self._slopes = [effects.value(*each) for each in SLOPE_EFFECTS.items()]
+        self._centre = effects.value("icr_offset", "x_icr"), effects.value("icr_lateral", "y_icr")
+        self._change = [effects.value("terrain_change", name) for name in ("at_x", "k_v", "k_w")]
+        self._odd = extra
+        self._state = State(dt=self.step_s)
+
+    def push(
+        self, index: int, at: tuple[float, float], *, axes: tuple[Vector, Vector], attitude: Vector
+    ) -> tuple[float, float, float]:
+        """Velocity to add in this cell: d_x [m/s], d_y [m/s], d_w [rad/s]."""
+        speed, turning = self._signals["v0"][index], self._signals["turning"][index]
+        slip, creep, side_slip, side_creep, side_turn = self._slopes
+        border, gain_v, gain_w = self._change
+        ahead, aside = -axes[0][2], -axes[1][2]
+        d_w = side_turn * aside * speed
+        # The centre of rotation stands aside for whatever turns the body.
+        d_x = (slip * abs(speed) + creep * turning) * ahead + self._centre[1] * d_w
+        d_y = (side_slip * abs(speed) + side_creep * turning) * aside - self._centre[0] * d_w
+        if at[0] > border:
+            base = self.velocity[index]
+            d_x += (gain_v - 1.0) * float(base[0])
+            d_w += (gain_w - 1.0) * float(base[2])
+        if self._odd is not None:
+            state = self._state
+            state.t = (index + 0.5) * self.step_s
+            state.x, state.y = at
+            state.roll, state.pitch, state.yaw = attitude
+            for name, signal in self._signals.items():
+                setattr(state, name, signal[index])
+            odd = self._odd(state)
+            d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
+        return d_x, d_y, d_w
 
 
 def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[float, float, float]) -> Path:
-    step = walk.step_s
+    step, count = walk.step_s, walk.velocity.shape[0]
     tilt = ground.tilt
     x, y, _ = rotate(tilt, np.array([start[0], start[1], 0.0])).tolist()
     ahead_x, ahead_y, ahead_z = rotate(tilt, np.array([math.cos(start[2]), math.sin(start[2]), 0.0])).tolist()
     normal = surface.normal_at(x, y)
     ahead = slide_onto_plane((ahead_x, ahead_y, ahead_z), normal)
-    position = np.empty((walk.cell_count + 1, 3))
-    angles = np.empty((walk.cell_count + 1, 3))
-    velocity = np.empty((walk.cell_count, 3))
-    forces = _Forces(walk)
+    position = np.empty((count + 1, 3))
+    angles = np.empty((count + 1, 3))
+    velocity = np.empty((count, 3))
     columns = zip(*(column.tolist() for column in walk.velocity.T), strict=True)
     for index, (base_x, base_y, base_w) in enumerate(columns):
         leftward = cross(normal, ahead)
         attitude = _attitude(ahead, leftward, normal)
         position[index] = x, y, surface.height_at(x, y)
         angles[index] = attitude
-        d_x, d_y, d_w = forces.push(index, (x, y), axes=(ahead, leftward), attitude=attitude)
+        d_x, d_y, d_w = walk.push(index, (x, y), axes=(ahead, leftward), attitude=attitude)
         v_x, v_y, v_w = base_x + d_x, base_y + d_y, base_w + d_w
         velocity[index] = v_x, v_y, v_w
         half_c, half_s = math.cos(0.5 * v_w * step), math.sin(0.5 * v_w * step)
@@ -400,7 +426,7 @@ def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[f
         ahead = slide_onto_plane(turned, normal)
     position[-1] = x, y, surface.height_at(x, y)
     angles[-1] = _attitude(ahead, cross(normal, ahead), normal)
-    time = np.arange(walk.cell_count + 1, dtype=np.float64) * step
+    time = np.arange(count + 1, dtype=np.float64) * step
     quaternion = quaternions_from_euler(angles[:, 0], angles[:, 1], angles[:, 2])
     return Path(time, position, quaternion, velocity)
 
@@ -409,54 +435,6 @@ def _attitude(ahead: Vector, leftward: Vector, normal: Vector) -> Vector:
     """Roll, pitch, yaw [rad] of a body with these axes in the world."""
     pitch = math.asin(max(-1.0, min(1.0, -ahead[2])))
     return math.atan2(leftward[2], normal[2]), pitch, math.atan2(ahead[1], ahead[0])
-
-
-class _Forces:
-    """What depends on where the body is: slope, a terrain's border, odd physics."""
-
-    def __init__(self, walk: _Walk) -> None:
-        effects = walk.effects
-        self._walk = walk
-        self._slip, self._creep = effects.value("slope_slip", "k"), effects.value("slope_creep", "c")
-        self._side_slip = effects.value("side_slope_slip", "k")
-        self._side_creep = effects.value("side_slope_creep", "c")
-        self._side_turn = effects.value("side_slope_turn", "k")
-        self._centre = effects.value("icr_offset", "x_icr"), effects.value("icr_lateral", "y_icr")
-        self._border = effects.value("terrain_change", "at_x")
-        self._gain_v = effects.value("terrain_change", "k_v")
-        self._gain_w = effects.value("terrain_change", "k_w")
-        self._odd = walk.extra
-        self._state = State(dt=walk.step_s)
-        signals = {"v0": walk.v0, "w0": walk.w0, "left_speed": walk.left, "right_speed": walk.right}
-        signals |= {"left_angle": walk.left_angle[:-1], "right_angle": walk.right_angle[:-1]}
-        signals |= {"steering": walk.steering, "turning": walk.turning}
-        self._signals = {name: signal.tolist() for name, signal in signals.items()}
-        self._turning = walk.turning.tolist()
-
-    def push(
-        self, index: int, at: tuple[float, float], *, axes: tuple[Vector, Vector], attitude: Vector
-    ) -> tuple[float, float, float]:
-        """Velocity to add in this cell: d_x [m/s], d_y [m/s], d_w [rad/s]."""
-        speed, turning = self._signals["v0"][index], self._turning[index]
-        ahead, aside = -axes[0][2], -axes[1][2]
-        d_w = self._side_turn * aside * speed
-        # The centre of rotation stands aside for whatever turns the body.
-        d_x = (self._slip * abs(speed) + self._creep * turning) * ahead + self._centre[1] * d_w
-        d_y = (self._side_slip * abs(speed) + self._side_creep * turning) * aside - self._centre[0] * d_w
-        if at[0] > self._border:
-            base = self._walk.velocity[index]
-            d_x += (self._gain_v - 1.0) * float(base[0])
-            d_w += (self._gain_w - 1.0) * float(base[2])
-        if self._odd is not None:
-            state = self._state
-            state.t = (index + 0.5) * self._walk.step_s
-            state.x, state.y = at
-            state.roll, state.pitch, state.yaw = attitude
-            for name, signal in self._signals.items():
-                setattr(state, name, signal[index])
-            odd = self._odd(state)
-            d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
-        return d_x, d_y, d_w
 
 
 _FUNCTIONS = {"abs": abs, "min": min, "max": max, **{n: f for n, f in vars(math).items() if n[0] != "_"}}

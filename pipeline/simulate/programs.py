@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -201,13 +202,16 @@ def _jitter_stamps(time: Floats, program: Program, generator: np.random.Generato
     return time + phase + noise
 
 
-def _steps(time: Floats, space: _Space) -> Drawn:
-    """Steps drawn uniformly from the command space, as in the DRIVE protocol: both ways, both directions."""
+def _steps(time: Floats, space: _Space, *, ahead: float = 1.0, turning: float = 1.0) -> Drawn:
+    """Steps drawn uniformly from the command space, as in the DRIVE protocol: both ways, both directions.
+
+    Of speed, or of turning on the spot, where the other is zero.
+    """
     count = int(time[-1] // space.step_s) + 1
     speed = space.generator.uniform(-space.speed, space.speed, count)
     turn = space.generator.uniform(-space.turn, space.turn, count)
     which = (time // space.step_s).astype(np.intp)
-    return speed[which], turn[which]
+    return ahead * speed[which], turning * turn[which]
 
 
 def _ramps(time: Floats, space: _Space) -> Drawn:
@@ -237,21 +241,9 @@ def _smooth(time: Floats, space: _Space) -> Drawn:
     return space.speed * np.tanh(0.6 * speed + 0.4), space.turn * np.tanh(0.8 * turn)
 
 
-def _straight(time: Floats, space: _Space) -> Drawn:
-    """Steps of speed only, both directions."""
-    speed, turn = _steps(time, space)
-    return speed, turn * 0.0
-
-
 def _circle(time: Floats, space: _Space) -> Drawn:
     """One circle for ever, at 60 % of both limits."""
     return np.full(time.size, 0.6 * space.speed), np.full(time.size, 0.6 * space.turn)
-
-
-def _spins(time: Floats, space: _Space) -> Drawn:
-    """Steps of turning on the spot, both ways."""
-    speed, turn = _steps(time, space)
-    return speed * 0.0, turn
 
 
 def _slalom(time: Floats, space: _Space) -> Drawn:
@@ -287,9 +279,9 @@ _PROGRAMS: dict[str, Callable[[Floats, _Space], Drawn]] = {
     "drive_steps": _steps,
     "ramps": _ramps,
     "smooth": _smooth,
-    "straight": _straight,
+    "straight": partial(_steps, turning=0.0),
     "circle": _circle,
-    "spins": _spins,
+    "spins": partial(_steps, ahead=0.0),
     "slalom": _slalom,
     "stop_and_go": _stop_and_go,
     "teleop": _teleop,

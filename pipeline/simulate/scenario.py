@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, quaternions_from_euler
-from pipeline.simulate.facts import VEHICLES, EffectSpec, Layout, SimulateError, Vehicle
+from pipeline.core import Floats, Ints, quaternions_from_euler
+from pipeline.simulate.facts import VEHICLES, EffectSpec, Field, Layout, SimulateError, Vehicle
 
 
 def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
@@ -15,7 +15,7 @@ def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
     return np.concatenate(([0.0], np.cumsum(signal) * step_s))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Commands:
     """Body commands at their own stamps.
 
@@ -67,36 +67,20 @@ class Drive:
         return integrate_cells(self.left, step_s=self.step_s), integrate_cells(self.right, step_s=self.step_s)
 
 
-IncidentKind = Literal[
-    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",
-    "digging_in", "spinning", "sliding",
-]  # fmt: skip
-INCIDENTS: tuple[IncidentKind, ...] = (
-    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",
-)  # fmt: skip
-TRACTION: tuple[IncidentKind, ...] = ("digging_in", "spinning", "sliding")
-"""Incidents of the ground under turning or locked wheels."""
-
-
 @dataclass(frozen=True)
-class Incident:
-    """One of `INCIDENTS` or `TRACTION`, from a time to a time [s].
+class BodyMotion:
+    """Velocities on the drive's cells.
 
-    An emergency stop brakes the wheels whatever is asked; who drives manually has the command topic say zero;
-    a vehicle is pushed while nothing is asked; commands that fall silent let the controller stop; a stuck
-    vehicle turns its wheels on the spot; a frozen localization repeats its last pose. A vehicle that digs
-    itself in moves less and less of what its wheels turn, for the first half of the time, and not at all in
-    the second; spinning wheels bring a quarter; a vehicle slides on locked wheels, ever slower.
+    Attributes:
+        v0, w0: body velocity before ground effects [m/s], [rad/s], shape (n,).
+        velocity: (v_x, v_y, v_w) so far [m/s, m/s, rad/s], shape (n, 3).
+        turning: one where the wheels turn, else zero, shape (n,).
     """
 
-    kind: IncidentKind
-    start_s: float
-    end_s: float
-
-    def contains(self, times: Floats) -> Flags:
-        """Which of some times it lasts at, shape (n,)."""
-        inside: Flags = (times >= self.start_s) & (times < self.end_s)
-        return inside
+    v0: Floats
+    w0: Floats
+    velocity: Floats
+    turning: Floats
 
 
 ProgramName = Literal[
@@ -306,21 +290,48 @@ class Clock:
         start_ns: stamp of the run's start, nanoseconds since 1970; 0 is a clock that was never set.
         unset_s: for this long the clock counts from zero, then it is set.
         backward_at_s, backward_s: at this time the clock goes back by that much; none when NaN.
-        real_time_factor: stamps count simulated time from zero, of which so much passes in a second of the
-            recorder's clock; None where one clock serves both.
-        swing: by which share that factor rises and falls, over seven seconds of simulated time.
-        drift_ppm: how much faster the robot's clock, which stamps, runs than the recorder's [1e-6].
-        bunch_s: the recorder gets messages in bunches of up to so long, as a bridge between networks does.
     """
 
     start_ns: int = 1_717_000_000_000_000_000
     unset_s: float = 0.0
     backward_at_s: float = float("nan")
     backward_s: float = 0.0
-    real_time_factor: float | None = None
-    swing: float = 0.0
-    drift_ppm: float = 0.0
-    bunch_s: float = 0.0
+
+    def stamp_headers(self, time_s: Floats) -> Ints:
+        """Nanoseconds that header stamps show at true times [s], shape (n,).
+
+        A clock that was set before the run began counts from its own time before the run, too: a pose that is
+        stamped early is a few moments older than the run. A clock that shows less than zero shows zero:
+        stamps are unsigned.
+        """
+        elapsed = np.rint(time_s * 1e9).astype(np.int64)
+        unset = (time_s < self.unset_s) & (self.unset_s > 0.0)
+        shown = np.where(unset, elapsed, self.start_ns + elapsed)
+        gone_back = time_s >= self.backward_at_s
+        shown = np.where(gone_back, shown - round(self.backward_s * 1e9), shown)
+        return np.maximum(shown, 0)
+
+    def stamp_log(self, time_s: Floats) -> Ints:
+        """Nanoseconds that the recorder's clock shows when it gets what came at true times [s], (n,)."""
+        return self.stamp_headers(time_s)
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Messages of one topic, in true seconds.
+
+    Attributes:
+        topic, type_name: where and what.
+        log_s: when the recorder got them, shape (n,).
+        header_s: what their headers say, shape (n,), or None for a type without header.
+        fields: values by field path; an array has one row a message.
+    """
+
+    topic: str
+    type_name: str
+    log_s: Floats
+    header_s: Floats | None
+    fields: Mapping[str, Field]
 
 
 @dataclass(frozen=True)
@@ -338,8 +349,7 @@ class Recording:
         command_turn_scale: factor on the difference of the recorded sides (made with another vehicle's
             track); None for that of the whole command.
         command_latency_s: from a command's stamp to the recorder.
-        gaps: how many holes of ``gap_s`` the whole recording has.
-        zero_stamps: topics whose headers say zero throughout.
+        lose: what else the recorder makes of the messages; None for nothing.
     """
 
     layout: str | Layout = "usual"
@@ -350,9 +360,7 @@ class Recording:
     command_scale: float = 1.0
     command_turn_scale: float | None = None
     command_latency_s: float = 0.001
-    gaps: int = 0
-    gap_s: float = 2.0
-    zero_stamps: tuple[str, ...] = ()
+    lose: Callable[[Messages], Messages] | None = None
 
 
 @dataclass(frozen=True)
@@ -370,13 +378,11 @@ class Scenario:
         ground, disturbance, pose, encoders, imu, clock, recording: see there. No encoders or IMU when None.
         extra: physics that no catalogue has, added to the body velocity; called 200 times a second.
         machinery: the same of the drivetrain: what wheels and steering do in place of what they would.
-        ground_input: whether ground effects act on the drive's v0, w0 (``drive``) or, as another plausible
-            order of nature, on what body inertia made of them (``inertia``).
+        upset: the same of the body, before slope and place act, in steps of so many seconds.
         step_s: integration step.
         played: commands that are driven in place of the program's; they count from their first one. None for
             the program.
         start_pose: x [m], y [m], yaw [rad] at the start.
-        incidents: what happens for seconds, see `Incident`.
     """
 
     vehicle: Vehicle = VEHICLES["husky"]
@@ -394,11 +400,10 @@ class Scenario:
     recording: Recording = Recording()
     extra: ExtraPhysics | None = None
     machinery: Callable[[Drive], Drive] | None = None
-    ground_input: Literal["drive", "inertia"] = "drive"
+    upset: Callable[[BodyMotion, float], BodyMotion] | None = None
     step_s: float = 0.001
     start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     played: Commands | None = None
-    incidents: tuple[Incident, ...] = ()
 
     def __post_init__(self) -> None:
         for name, value, low, high in (

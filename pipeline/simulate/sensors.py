@@ -77,28 +77,28 @@ def read_encoders(encoders: Encoders, drive: Drive, *, duration_s: float, seed: 
     middle = (np.arange(drive.left.size) + 0.5) * drive.step_s
     edges = np.arange(drive.left.size + 1) * drive.step_s
     noise = generator.standard_normal((3, time.size)) * encoders.noise_radps
-    left_angle, right_angle = drive.wheel_angles()
-    if drive.corners is not None:
-        shaken = generator.standard_normal((4, time.size)) * encoders.noise_radps
-        speeds, angles = {}, {}
-        for (corner, wheel), added in zip(drive.corners.items(), shaken, strict=True):
-            speeds[corner] = encoders.gain * (np.interp(at, middle, wheel) + added)
-            turned = integrate_cells(wheel, step_s=drive.step_s)
-            angles[corner] = encoders.gain * np.interp(at, edges, turned)
-        (left, right), (left_angle, right_angle) = (
-            [0.5 * (readings[f"front_{side}"] + readings[f"rear_{side}"]) for side in ("left", "right")]
-            for readings in (speeds, angles)
-        )
-        straight = np.zeros_like(time)
-        return WheelReadings(time, left, right, left_angle, right_angle, straight, speeds, angles)
-    return WheelReadings(
-        time,
-        encoders.gain * (np.interp(at, middle, drive.left) + noise[0]),
-        encoders.gain * (np.interp(at, middle, drive.right) + noise[1]),
-        encoders.gain * np.interp(at, edges, left_angle),
-        encoders.gain * np.interp(at, edges, right_angle),
-        np.interp(at, middle, drive.steering) + _STEERING_SHARE * noise[2],
+
+    def read(wheel: Floats, added: Floats) -> tuple[Floats, Floats]:
+        turned = integrate_cells(wheel, step_s=drive.step_s)
+        speed = encoders.gain * (np.interp(at, middle, wheel) + added)
+        return speed, encoders.gain * np.interp(at, edges, turned)
+
+    if drive.corners is None:
+        (left, left_angle), (right, right_angle) = read(drive.left, noise[0]), read(drive.right, noise[1])
+        steering = np.interp(at, middle, drive.steering) + _STEERING_SHARE * noise[2]
+        return WheelReadings(time, left, right, left_angle, right_angle, steering)
+    shaken = generator.standard_normal((4, time.size)) * encoders.noise_radps
+    corners = {
+        corner: read(wheel, added)
+        for (corner, wheel), added in zip(drive.corners.items(), shaken, strict=True)
+    }
+    speeds, angles = ({corner: one[i] for corner, one in corners.items()} for i in (0, 1))
+    (left, right), (left_angle, right_angle) = (
+        [0.5 * (readings[f"front_{side}"] + readings[f"rear_{side}"]) for side in ("left", "right")]
+        for readings in (speeds, angles)
     )
+    straight = np.zeros_like(time)
+    return WheelReadings(time, left, right, left_angle, right_angle, straight, speeds, angles)
 
 
 def read_imu(imu: Imu, path: Path, *, duration_s: float, seed: int) -> ImuReadings:

@@ -87,7 +87,7 @@ if TYPE_CHECKING:
         STRING_TYPE,
         choose_sources,
         find_pose_fields,
-        list_topics,
+        list_named,
     )
 else:
     __getattr__ = open_door(__name__, __file__)

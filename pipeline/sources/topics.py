@@ -230,9 +230,7 @@ class _Chooser:
         poses |= {*self.with_part("fix"), *numbers.ground_velocities()}
         drives -= set(numbers.ground_velocities())
         robots = find_robots(drives, poses)
-        named = (*list_topics(configuration.command), *list_topics(configuration.wheels))
-        pose = configuration.pose.topic or configuration.pose.x
-        named = tuple(filter(None, (*named, pose, configuration.imu.topic)))
+        named = list_named(configuration)
         self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
         if self._robot is not None:
             others = ", ".join(robot.strip("/") for robot in robots if robot != self._robot)
@@ -492,6 +490,14 @@ def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str
             beside = [angle for angle in angles if angle.rpartition(".")[0] == space]
             return path, other, next(iter((*beside, *angles)), "")
     return None
+
+
+def list_named(configuration: Configuration) -> list[str]:
+    """Topics that the configuration names, those of drives first."""
+    pose = configuration.pose
+    given = (pose.topic, pose.x, pose.y, pose.yaw, configuration.imu.topic)
+    drives = (*list_topics(configuration.command), *list_topics(configuration.wheels))
+    return [Signal.parse(text).topic for text in (*drives, *given) if text]
 
 
 def list_topics(section: DriveSection) -> Iterable[str]:

@@ -1,8 +1,10 @@
 """The only writer of results: whole generations of tables, published in one moment.
 
-A run's results are a folder of Parquet tables and texts that never changes after its commit; the run's
-manifest points at the current one and is replaced last. Killed at any moment, readers see the old results or
-the new ones, never a mix, and the next writer cleans up. Rows that break a contract are kept and counted.
+A run is a folder. Its generations are numbered folders in it, of Parquet tables and texts, which never change
+after their commit; its manifest says which number is the current one, and is replaced last. Lower numbers are
+older, and go when results are pruned; a higher one is of a writer that is at work or was killed, and goes
+when the next begins. So readers see the old results or the new ones, never a mix. One lock a run keeps
+writers apart. Rows that break a contract are kept and counted.
 """
 
 from typing import TYPE_CHECKING
@@ -10,25 +12,15 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.store.checksums import LOG_NOTES, load_manifest, parse_manifest
-    from pipeline.store.files import (
-        JSON,
-        MANIFEST,
-        TEMPORARY,
-        Manifest,
-        Partition,
-        hold_lock,
-        make_folder,
-        replace_file,
-        temporary_beside,
-    )
-    from pipeline.store.generation import STEPS, Generation
+    from pipeline.store.checksums import LOG_NOTES
+    from pipeline.store.files import hold_lock, make_folder, replace_file, temporary_beside
+    from pipeline.store.generation import Generation
+    from pipeline.store.manifests import JSON, MANIFEST, Manifest
     from pipeline.store.names import (
         Sample,
         StoreError,
-        TableReport,
+        TableEntry,
         Tally,
-        check_home,
         date_runs,
         encode_run,
         name_damage,
@@ -40,8 +32,8 @@ if TYPE_CHECKING:
         check_size,
         check_table,
     )
-    from pipeline.store.results_folder import RUNS, Store, scan_table
-    from pipeline.store.stored_files import SUMMARY, convert_stored, decode_stored, read_stored
+    from pipeline.store.results_folder import Store, list_old
+    from pipeline.store.stored_files import SUMMARY, convert_stored, read_stored
     from pipeline.store.stored_runs import (
         ANALYZE_FIRST,
         DIAGNOSIS,
@@ -64,6 +56,6 @@ if TYPE_CHECKING:
         stored_contexts,
         stored_keys,
     )
-    from pipeline.store.verification import DiskFiles, Examination, Problem
+    from pipeline.store.verification import RUNS, Examination, Problem
 else:
     __getattr__ = open_door(__name__, __file__)

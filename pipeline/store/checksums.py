@@ -1,16 +1,14 @@
-"""Small JSON files with a checksum of their own: the manifest of a run, and notes."""
+"""Small JSON files with a checksum of their own, and notes made of them."""
 
 import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
 
-from pipeline.core import PathError, read_bounded, resolve_inside
-from pipeline.store.files import JSON, MANIFEST, FileEntry, Manifest, TableEntry, hash_bytes, replace_file
-from pipeline.store.names import StoreError, is_file_name, is_key, join_inside
+from pipeline.core import read_bounded
+from pipeline.store.files import hash_bytes, replace_file
+from pipeline.store.names import StoreError, join_inside
 
 # Small JSON files that carry a checksum of themselves, so that no byte of them changes unnoticed.
 #
@@ -64,107 +62,6 @@ def decode_checked(data: bytes) -> dict[str, object]:
     return content
 
 
-FORMAT = 1
-"""Raised when an older version could not read what a newer one writes."""
-
-
-def encode_manifest(manifest: Manifest) -> bytes:
-    """The manifest as the content of its file.
-
-    Raises:
-        StoreError: ``bad_details``, the details hold something JSON has no word for.
-    """
-    try:
-        return encode_checked(
-            {"format": FORMAT, **asdict(manifest), "folder": manifest.folder.name}, indent=1
-        )
-    except (TypeError, ValueError) as error:
-        hint = "Give texts, finite numbers, lists and mappings with text keys only"
-        raise StoreError(
-            "bad_details", f"the details of a generation must be JSON: {error}", where=manifest.run, hint=hint
-        ) from error
-
-
-def load_manifest(home: Path) -> Manifest | None:
-    """The manifest in a run's folder; None when there is none.
-
-    Raises:
-        StoreError: ``manifest_damaged``; ``manifest_too_new``, a newer version wrote it; ``not_a_file``;
-            ``file_outside``, it is a link that leads away.
-        OSError: the file cannot be read.
-    """
-    try:
-        data = read_bounded(join_inside(home, MANIFEST))
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    return parse_manifest(data, home)
-
-
-def parse_manifest(data: bytes, home: Path) -> Manifest:
-    """The manifest in the content of its file.
-
-    Args:
-        data: the content.
-        home: the run's folder.
-
-    Raises:
-        StoreError: ``manifest_damaged``, or ``manifest_too_new`` when a newer version wrote it.
-    """
-    import msgspec  # noqa: PLC0415 - heavy, and `slip --help` imports this room
-
-    path = home / MANIFEST
-    try:
-        written_in = msgspec.json.decode(data, type=_Header).format
-        if written_in > FORMAT:
-            raise StoreError(
-                "manifest_too_new",
-                f"the results are in format {written_in}, this version reads up to {FORMAT}",
-                where=str(path),
-                hint="Use the newer version, or another folder with --results",
-            )
-        stored = msgspec.json.decode(data, type=_Stored)
-        _check_names(stored)
-        check_checksum(data)
-        folder = resolve_inside(home, stored.folder)
-    except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
-        said = error.what if isinstance(error, PathError) else " ".join(str(error).split())
-        hint = "Delete this one file and analyze its log again"
-        raise StoreError(
-            "manifest_damaged", f"the manifest is damaged ({said})", where=str(path), hint=hint
-        ) from error
-    content = {key: value for key, value in vars(stored).items() if key != "format"}
-    return Manifest(**content | {"folder": folder})
-
-
-@dataclass(frozen=True)
-class _Header:
-    format: int
-
-
-@dataclass(frozen=True)
-class _Stored:
-    format: int
-    run: str
-    key: str
-    folder: str
-    tables: dict[str, TableEntry]
-    files: dict[str, FileEntry]
-    details: dict[str, Any]
-    earlier: tuple[str, ...]
-
-
-def _check_names(stored: _Stored) -> None:
-    # Files are read and old folders removed by these names: an edited one must not lead elsewhere.
-    for name in (stored.folder, *stored.earlier, *stored.tables, *stored.files):
-        if not is_file_name(name) or ("/" in name and name not in stored.files):
-            raise ValueError(f"it names {name!r}")
-    for table in stored.tables:
-        if f"{table}.parquet" not in stored.files:
-            raise ValueError(f"it names no file for the table {table!r}")
-    if not is_key(stored.key):
-        raise ValueError(f"its key is {stored.key!r}")
-
-
 # Small notes beside the results, one file with a checksum each: replaced whole, by many at once without
 # waiting.
 #
@@ -177,9 +74,6 @@ LOG_NOTES = "batch/logs"
 
 NOTES = ("batch/", "identities/")
 """How the names of all notes in the results begin."""
-
-AGAIN_NOTES = "batch/again"
-"""Folder of the notes on runs that are to be made again."""
 
 
 class Notes:
@@ -198,7 +92,7 @@ class Notes:
         self._folder = folder
         join_inside(root, folder)
 
-    def write(self, name: str, content: Mapping[str, JSON]) -> bool:
+    def write(self, name: str, content: Mapping[str, object]) -> bool:
         """Write a note in the place of the one before; failing to is no error.
 
         Returns:
@@ -213,13 +107,13 @@ class Notes:
             return False
         return True
 
-    def read(self, name: str) -> dict[str, JSON] | None:
+    def read(self, name: str) -> dict[str, object] | None:
         """A note; None when there is none that can be read."""
         with suppress(StoreError):
             return _load(self.path_of(name))
         return None
 
-    def read_all(self) -> Iterator[dict[str, JSON]]:
+    def read_all(self) -> Iterator[dict[str, object]]:
         """Every note that can be read, in no order that matters."""
         for path in sorted((self._root / self._folder).glob("*/*.json")):
             content = _load(path)
@@ -241,9 +135,9 @@ class Notes:
         return join_inside(self._root, f"{self._folder}/{digits[:2]}/{digits[2:]}.json")
 
 
-def _load(path: Path) -> dict[str, JSON] | None:
+def _load(path: Path) -> dict[str, object] | None:
     try:
         # Nothing but a file is opened: a pipe would be waited for.
-        return cast("dict[str, JSON]", decode_checked(read_bounded(path))) if path.is_file() else None
+        return decode_checked(read_bounded(path)) if path.is_file() else None
     except (OSError, ValueError):
         return None

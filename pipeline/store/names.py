@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
@@ -22,33 +22,17 @@ NO_FACTS: Mapping[str, float] = MappingProxyType({})
 """Numbers of a table that has none."""
 
 
+_UNTOUCHED = "then run the same command again; the results that were there before are untouched"
+_FREE = f"Free space or choose another folder with --results, {_UNTOUCHED}"
 _KNOWN = (
-    (
-        (errno.ENOSPC,),
-        "disk_full",
-        "the disk of the results is full",
-        (
-            "Free space or choose another folder with --results, then run the same command again; "
-            "the results that were there before are untouched"
-        ),
-    ),
-    (
-        (errno.EDQUOT,),
-        "quota_used_up",
-        "your quota on the disk of the results is used up",
-        (
-            "Free space or choose another folder with --results, then run the same command again; "
-            "the results that were there before are untouched"
-        ),
-    ),
+    ((errno.ENOSPC,), "disk_full", "the disk of the results is full", _FREE),
+    ((errno.EDQUOT,), "quota_used_up", "your quota on the disk of the results is used up", _FREE),
     (
         (errno.EFBIG,),
         "file_limit",
         "the system stopped a write: the file would exceed its limit on the size of files",
-        (
-            "Raise the limit (ulimit -f unlimited) or choose a folder on another file system with --results, "
-            "then run the same command again; the results that were there before are untouched"
-        ),
+        "Raise the limit (ulimit -f unlimited) or choose a folder on another file system with --results, "
+        + _UNTOUCHED,
     ),
     (
         (errno.EROFS,),
@@ -127,9 +111,11 @@ LONGEST_PART = 120
 """Bytes of one part of a path; file systems allow 255, encrypted ones 143."""
 
 _HASH_DIGITS = 16
-_RESERVED = ("manifest.json", "latest")
+GENERATION = re.compile(r"generation-([1-9][0-9]*)")
+"""Name of the folder of a run's generation, with its number."""
+
+_RESERVED = re.compile(rf"manifest\.json|latest|{GENERATION.pattern}", re.IGNORECASE)
 _UNSAFE = frozenset('%~/\\*?"<>|')
-_KEY = re.compile(r"[0-9A-Za-z][0-9A-Za-z_-]{0,63}")
 _FILE_NAME = re.compile(r"[0-9A-Za-z_][0-9A-Za-z_. -]{0,99}(?:/[0-9A-Za-z_][0-9A-Za-z_. -]{0,99})*")
 
 
@@ -142,7 +128,7 @@ def encode_run(run: str) -> PurePosixPath:
     Raises:
         StoreError: ``bad_run_name``, the name is empty or cannot be written as UTF-8.
     """
-    if not run or not _is_writable(run):
+    if not run or any("\ud800" <= character <= "\udfff" for character in run):
         hint = "Rename the log to a name that is not empty and is valid Unicode"
         raise StoreError("bad_run_name", f"{run!r} cannot name a run", hint=hint)
     folder, slash, stem = run.rpartition("/")
@@ -177,17 +163,6 @@ def name_clash(run: str, other: str, folder: Path) -> StoreError:
     )
 
 
-def check_key(key: str) -> None:
-    """Refuse generation keys that are not a plain word of at most 64 letters, digits, ``_`` and ``-``.
-
-    Raises:
-        StoreError: ``bad_key``.
-    """
-    if not is_key(key):
-        hint = "Use letters, digits, _ and - only, at most 64"
-        raise StoreError("bad_key", f"{key!r} cannot be the key of a generation", hint=hint)
-
-
 def check_file_name(name: str) -> None:
     """Refuse file names that could leave their folder or hide in it.
 
@@ -197,11 +172,6 @@ def check_file_name(name: str) -> None:
     if not is_file_name(name):
         hint = "Use letters, digits, dots, _ and -, and start with a letter or a digit"
         raise StoreError("bad_file_name", f"{name!r} cannot name a file of the results", hint=hint)
-
-
-def is_key(key: str) -> bool:
-    """Whether a text can be the key of a generation."""
-    return _KEY.fullmatch(key) is not None
 
 
 def join_inside(folder: Path, name: str) -> Path:
@@ -222,14 +192,6 @@ def is_file_name(name: str) -> bool:
     return _FILE_NAME.fullmatch(name) is not None
 
 
-def _is_writable(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _encode_part(part: str) -> str:
     normal = unicodedata.normalize("NFC", part)
     last = len(normal) - 1
@@ -237,7 +199,7 @@ def _encode_part(part: str) -> str:
         _encode_character(character) if _is_unsafe(character, at, last) else character
         for at, character in enumerate(normal)
     )
-    if encoded.casefold() in _RESERVED:
+    if _RESERVED.fullmatch(encoded):
         encoded = _encode_character(encoded[0]) + encoded[1:]
     if may_lead_out(encoded):
         encoded = "".join(
@@ -305,12 +267,20 @@ QUARANTINE = "quarantine_"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableReport:
-    """What became of a frame: rows kept, rows quarantined, and how many rows broke each rule."""
+class TableEntry:
+    """What became of a frame: a table of a generation, in the file ``<table>.parquet``.
+
+    Attributes:
+        rows: rows that keep the contract.
+        quarantined: rows that break it; they stand in ``quarantine_<table>.parquet``.
+        contract_version: version of the contract it was written under.
+        rules: how many rows broke each rule.
+    """
 
     rows: int
     quarantined: int
-    rules: Mapping[str, int]
+    contract_version: int
+    rules: Mapping[str, int] = field(default_factory=dict)
 
 
 @contextmanager

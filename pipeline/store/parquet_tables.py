@@ -19,7 +19,7 @@ from pipeline.store.names import (
     NO_FACTS,
     QUARANTINE,
     StoreError,
-    TableReport,
+    TableEntry,
     name_damage,
     table_damaged,
 )
@@ -66,7 +66,7 @@ class CheckedTable:
     contract: Contract
     valid: pl.DataFrame
     broken: pl.DataFrame | None
-    report: TableReport
+    report: TableEntry
     facts: Mapping[str, float] = field(default_factory=dict)
 
     def encode(self) -> tuple[bytes, bytes | None]:
@@ -236,8 +236,11 @@ def check_table(name: str, frame: pl.DataFrame, facts: Mapping[str, float] = NO_
             hint="Correct the code that makes the table, or its contract",
         )
     valid, failure = contract.schema.filter(frame.select(schema.names()))
-    report = TableReport(
-        rows=valid.height, quarantined=len(failure), rules=dict(sorted(failure.counts().items()))
+    report = TableEntry(
+        rows=valid.height,
+        quarantined=len(failure),
+        contract_version=contract.version,
+        rules=dict(sorted(failure.counts().items())),
     )
     return CheckedTable(
         contract=contract,

@@ -1,34 +1,43 @@
 """A folder of results: its runs, their generations, the tables over all runs, and questions in SQL."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
+from typing import TypeAlias
 
 import polars as pl
 
 from pipeline.core import read_bounded_text, shorten
-from pipeline.store import files
-from pipeline.store.checksums import AGAIN_NOTES, Notes, encode_manifest, load_manifest
+from pipeline.store.checksums import Notes
 from pipeline.store.files import (
-    MANIFEST,
-    MARKER,
-    Manifest,
-    Partition,
+    TEMPORARY,
     hash_bytes,
     hold_lock,
+    make_folder,
+    remove,
+    replace_file,
+    temporary_beside,
+    write_file,
 )
-from pipeline.store.generation import Generation, point_latest, remove_orphans
+from pipeline.store.generation import Generation
+from pipeline.store.manifests import (
+    MANIFEST,
+    Manifest,
+    encode_manifest,
+    list_generations,
+    load_manifest,
+)
 from pipeline.store.names import (
     QUARANTINE,
     Sample,
     StoreError,
-    TableReport,
+    TableEntry,
     check_file_name,
     check_home,
-    check_key,
     date_runs,
     encode_run,
     join_inside,
@@ -36,12 +45,17 @@ from pipeline.store.names import (
     name_disk_errors,
 )
 from pipeline.store.parquet_tables import check_size, check_table, find_contract, schema_of
-from pipeline.store.verification import DiskFiles, Examination, examine_files
+from pipeline.store.verification import RUNS, Examination, examine_results
 from schemas import list_contracts
 
 LOCK = ".lock"
-RUNS = "runs"
 CLAIMS = "batch/claims"
+
+Asked: TypeAlias = Mapping[str, str | None]
+"""The part of the runs that a question is about: ``vehicle``, ``terrain``, ``dataset`` and ``day``, a date or
+the beginning of one; what is None is not asked."""
+
+_ALL: Asked = MappingProxyType({})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,22 +72,18 @@ class Store:
     Args:
         root: the results folder.
         patience_s: how long a writer waits for another one of the same run.
-        watch: called with the name of every step of a commit (`STEPS`).
     """
 
-    def __init__(
-        self, root: Path, *, patience_s: float = 60.0, watch: Callable[[str], None] = files.do_nothing
-    ) -> None:
+    def __init__(self, root: Path, *, patience_s: float = 60.0) -> None:
         self.root = Path(root)
         self._patience_s = patience_s
-        self._watch = watch
 
     def manifest(self, run: str) -> Manifest | None:
         """The current generation of a run; None when there is none.
 
         Raises:
-            StoreError: ``manifest_damaged``, ``manifest_too_new``, ``bad_run_name``, or another run's
-                results stand in the folder (``name_clash``).
+            StoreError: ``manifest_damaged``, ``other_version``, ``bad_run_name``, or another run's results
+                stand in the folder (``name_clash``).
         """
         home = self._home_of(run)
         with name_disk_errors(home):
@@ -102,14 +112,10 @@ class Store:
                     manifest = load_manifest(home)
                 if manifest is not None:
                     check_home(manifest.run, home, top=self.root / RUNS)
+                    manifests.append(manifest)
             except StoreError as error:
                 errors.append(error)
-                continue
-            if manifest is not None:
-                manifests.append(manifest)
-        return Survey(
-            manifests=tuple(sorted(manifests, key=lambda manifest: manifest.run)), errors=tuple(errors)
-        )
+        return Survey(manifests=tuple(sorted(manifests, key=lambda one: one.run)), errors=tuple(errors))
 
     def runs(self) -> tuple[str, ...]:
         """Names of all runs that have a current generation, sorted.
@@ -122,8 +128,9 @@ class Store:
     def run_dirs(self) -> tuple[Path, ...]:
         """Folders of all runs that have a manifest, readable or not, sorted."""
         top = self.root / RUNS
-        folders = [path.parent for depth in ("*", "*/*") for path in top.glob(f"{depth}/{MANIFEST}")]
-        return tuple(sorted(home for home in folders if not (home / MARKER).exists()))
+        return tuple(
+            sorted(path.parent for depth in ("*", "*/*") for path in top.glob(f"{depth}/{MANIFEST}"))
+        )
 
     @contextmanager
     def open_generation(self, run: str, key: str) -> Iterator[Generation]:
@@ -134,89 +141,117 @@ class Store:
             key: hash of everything the results depend on; may be the current one.
 
         Raises:
-            StoreError: ``locked``, ``bad_key``, ``bad_run_name``, a damaged manifest, or the disk refuses.
+            StoreError: ``locked``, ``bad_run_name``, a damaged manifest, or the disk refuses.
         """
-        check_key(key)
-        with self._lock_run(run) as home:
+        home = self._home_of(run)
+        with self._lock(home):
             previous = self.manifest(run)
-            is_asked_again = previous is not None and self.is_asked_again(previous)
             with name_disk_errors(home):
-                files.remove_leftovers(home)
-                remove_orphans(home, previous)
-            generation = Generation(
-                run=run,
-                key=key,
-                home=home,
-                previous=previous,
-                keeps_previous=previous is not None and not is_asked_again,
-                watch=self._watch,
-            )
+                for number, folder in list_generations(home).items():
+                    # Of a writer that was killed just before its last step.
+                    if previous is None or number > previous.number:
+                        remove(folder)
+                generation = Generation(run=run, key=key, home=home, previous=previous)
             try:
                 yield generation
             finally:
-                generation.discard()
+                if not generation.is_published:
+                    with suppress(OSError):
+                        remove(generation.folder)
 
-    def read(self, run: str, table: str) -> pl.DataFrame:
-        """A table of a run's current generation.
+    def scan(
+        self, table: str, manifests: Sequence[Manifest] | None = None, asked: Asked = _ALL
+    ) -> pl.LazyFrame:
+        """A table over the current generations of runs, with that of the whole results (``datasets``).
 
-        Raises:
-            StoreError: ``no_such_run``, ``no_such_table``, or the file is gone or damaged.
-        """
-        manifest = self.manifest(run)
-        while True:
-            if manifest is None:
-                hint = "Analyze its log first, or look with `slip results status` for the runs there are"
-                raise StoreError(
-                    "no_such_run", f"there are no results of {run!r}", where=str(self.root), hint=hint
-                )
-            try:
-                return manifest.read(table)
-            except StoreError:
-                # A generation pruned between the look at the manifest and at the file has a successor.
-                newer = self.manifest(run)
-                if newer == manifest:
-                    raise
-                manifest = newer
-
-    def scan(self, table: str, partition: Partition | None = None) -> pl.LazyFrame:
-        """A table over the current generations of all runs, or one of the whole results (``datasets``).
+        Tables written under another version of the contract are fitted to the present one: columns that were
+        not there are null, columns that are no more are left out.
 
         Args:
             table: a table's name, ``quarantine_<table>``, or ``runs`` for one row a run.
-            partition: the runs to look at, told from their manifests: no file of another one is opened.
+            manifests: the runs, which date each other; None for all.
+            asked: those of them to look at, told from their manifests: no file of another one is opened.
 
         Returns:
             The contract's columns, empty when no run has any.
 
         Raises:
-            StoreError: ``no_such_table``, or a manifest is damaged.
+            StoreError: ``no_such_table``; a manifest or a table is damaged; ``file_outside`` or
+                ``not_a_file``, a link or a pipe stands for it.
         """
-        return scan_table(table, root=self.root, manifests=self.manifests(), partition=partition)
+        manifests = self.manifests() if manifests is None else manifests
+        if table == RUNS_TABLE:
+            return pl.LazyFrame([row for _, row in _list_rows(manifests, asked)], schema=_RUNS_SCHEMA)
+        schema = schema_of(table)
+        name = table.removeprefix(QUARANTINE)
+        present = find_contract(name).version
+        current: list[Path] = []
+        others: list[Path] = []
+        for manifest in [one for one, _ in _list_rows(manifests, asked)] if asked else manifests:
+            if name in manifest.tables and f"{table}.parquet" in manifest.files:
+                path = manifest.path(table)
+                check_size(path, manifest.count_rows(table))
+                is_present = manifest.tables[name].contract_version == present
+                (current if is_present else others).append(path)
+        pooled = join_inside(self.root, f"{table}.parquet")
+        if pooled.exists():
+            check_size(pooled, None)
+            others.append(pooled)
+        frames = [pl.scan_parquet(current, glob=False)] if current else []
+        frames += [_fit(pl.scan_parquet(path, glob=False), schema) for path in others]
+        return pl.concat(frames) if frames else pl.LazyFrame(schema=schema)
 
-    def query(self, sql: str, partition: Partition | None = None) -> pl.DataFrame:
-        """Answer SQL over all tables by name.
+    def query(self, sql: str, asked: Asked = _ALL) -> pl.DataFrame:
+        """Answer SQL over all tables and their quarantines by name.
 
         Args:
             sql: the question.
-            partition: the runs to look at, as for `scan`.
+            asked: the runs to look at, as for `scan`.
 
         Raises:
-            StoreError: ``bad_query``, or a manifest or a table is damaged.
+            StoreError: ``bad_query``, with what polars says about it; ``file_missing`` or ``table_damaged``,
+                a table is not what its manifest says; a manifest is damaged.
         """
-        return answer_query(sql, root=self.root, manifests=self.manifests(), partition=partition)
+        if _QUESTION.match(sql) is None:
+            what = "the query cannot be answered: it does not begin with SELECT or WITH"
+            hint = "Queries read tables and never change them: SELECT run, vehicle FROM runs"
+            raise StoreError("bad_query", what, where=shorten(sql), hint=hint)
+        names = [contract.name for contract in list_contracts()]
+        known = (RUNS_TABLE, *names, *(f"{QUARANTINE}{name}" for name in names))
+        # With many runs, getting every table ready takes longer than the answer: only those spoken of.
+        said = {word.lower() for word in re.findall(r"\w+", sql)}
+        spoken = [name for name in known if name in said]
+        scan = partial(self.scan, manifests=self.manifests(), asked=asked)
+        try:
+            return pl.SQLContext({name: scan(name) for name in spoken}).execute(sql, eager=True)
+        except (
+            pl.exceptions.PolarsError,
+            pl.exceptions.PanicException,
+            UnicodeEncodeError,
+            OSError,
+        ) as error:
+            what = str(error).partition("\n")[0]
+            hint = f"The tables are: {', '.join((RUNS_TABLE, *names))}"
+            if "no column named" in what:
+                columns = ((name, _RUNS_SCHEMA if name == RUNS_TABLE else schema_of(name)) for name in spoken)
+                hint = "; ".join(f"Columns of {name}: {', '.join(schema)}" for name, schema in columns)
+            raise StoreError(
+                "bad_query", f"the query cannot be answered: {what}", where=shorten(sql), hint=hint
+            ) from error
 
     def examine(self, sample: Sample | None = None) -> Examination:
         """Read everything again, or a sample; what is not what was written, and what cannot be judged."""
-        return examine_files(DiskFiles(self.root), sample=sample)
+        return examine_results(self.root, sample)
 
     def ask_again(self, manifest: Manifest) -> None:
-        """Have a run made again by whoever analyzes its log next; until then readers keep its results."""
-        self.notes(AGAIN_NOTES).write(manifest.run, {"run": manifest.run, "folder": manifest.folder.name})
+        """Have a run made again by whoever analyzes its log next; until then readers keep its results.
 
-    def is_asked_again(self, manifest: Manifest) -> bool:
-        """Whether exactly this generation is to be made again."""
-        note = self.notes(AGAIN_NOTES).read(manifest.run)
-        return note is not None and note.get("folder") == manifest.folder.name
+        Raises:
+            StoreError: ``locked``, or the disk refuses.
+        """
+        with self._lock(manifest.home), name_disk_errors(manifest.home):
+            if load_manifest(manifest.home) == manifest:
+                replace_file(manifest.home / MANIFEST, encode_manifest(replace(manifest, again=True)))
 
     def remove(self, name: str) -> None:
         """Remove a file that nobody can use any more: a damaged manifest or note.
@@ -237,15 +272,17 @@ class Store:
         Raises:
             StoreError: ``locked``, a damaged manifest, or the disk refuses.
         """
-        if keep < 0:
-            raise StoreError("bad_keep", f"cannot keep {keep} generations", hint="Give 0 or more")
         removed: list[Path] = []
         for manifest in self.manifests():
-            with self._lock_run(manifest.run) as home:
-                removed += self._prune_run(manifest.run, home, keep)
+            if len(list_old(manifest)) <= keep:
+                continue
+            with self._lock(manifest.home), name_disk_errors(manifest.home):
+                for folder in list_old(manifest)[keep:]:
+                    remove(folder)
+                    removed.append(folder)
         return tuple(removed)
 
-    def write_results_table(self, name: str, frame: pl.DataFrame) -> TableReport:
+    def write_results_table(self, name: str, frame: pl.DataFrame) -> TableEntry:
         """Write a table of the whole results, ``<name>.parquet``, in the place of the one before.
 
         Rows that break the contract go to ``quarantine_<name>.parquet``, removed when there are none.
@@ -254,14 +291,13 @@ class Store:
             StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
         """
         checked = check_table(name, frame)
-        valid, broken = checked.encode()
-        quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
-            files.replace_file(self.root / f"{name}.parquet", valid)
-            if broken is None:
-                quarantine.unlink(missing_ok=True)
-            else:
-                files.replace_file(quarantine, broken)
+            for prefix, data in zip(("", QUARANTINE), checked.encode(), strict=True):
+                path = self.root / f"{prefix}{name}.parquet"
+                if data is None:
+                    path.unlink(missing_ok=True)
+                else:
+                    replace_file(path, data)
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:
@@ -273,9 +309,7 @@ class Store:
         check_file_name(name)
         path = join_inside(self.root, name)
         with self._lock(self.root), name_disk_errors(path):
-            files.make_folder(path.parent)
-            files.remove_leftovers(path.parent)
-            files.replace_file(path, text.encode())
+            replace_file(path, text.encode())
         return path
 
     def edit_results_text(self, name: str, edit: Callable[[str], str]) -> None:
@@ -294,7 +328,7 @@ class Store:
             except UnicodeDecodeError:
                 return
             if (edited := edit(text)) != text:
-                files.replace_file(path, edited.encode())
+                replace_file(path, edited.encode())
 
     def notes(self, folder: str) -> Notes:
         """Small notes beside the results, in a folder of their own."""
@@ -307,8 +341,8 @@ class Store:
             StoreError: ``read_only``, ``permission_denied``, ``disk_full``, ``locked``, ...
         """
         with self._lock(self.root), name_disk_errors(self.root):
-            probe = files.temporary_beside(self.root / "probe")
-            files.write_new_file(probe, b"may be written")
+            probe = temporary_beside(self.root / "probe")
+            write_file(probe, b"may be written", durable=True)
             probe.unlink()
 
     @contextmanager
@@ -320,7 +354,7 @@ class Store:
         """
         folder = join_inside(self.root, CLAIMS)
         with name_disk_errors(folder):
-            files.make_folder(folder)
+            make_folder(folder)
         try:
             with hold_lock(folder / hash_bytes(name.encode())[:3], patience_s=0.0):
                 yield True
@@ -333,38 +367,20 @@ class Store:
         return join_inside(self.root / RUNS, str(encode_run(run)))
 
     @contextmanager
-    def _lock_run(self, run: str) -> Iterator[Path]:
-        home = self._home_of(run)
-        for folder in (home, home.parent):
-            if (folder / MARKER).exists():
-                raise name_clash(run, folder.parent.name, folder)
-        with self._lock(home):
-            yield home
-
-    @contextmanager
     def _lock(self, folder: Path) -> Iterator[None]:
         with name_disk_errors(folder):
-            files.make_folder(folder)
+            make_folder(folder)
         with hold_lock(folder / LOCK, patience_s=self._patience_s):
             with name_disk_errors(folder):
-                files.remove_leftovers(folder)
+                # What killed writers left.
+                for path in folder.glob(f"{TEMPORARY}*"):
+                    remove(path)
             yield
 
-    def _prune_run(self, run: str, home: Path, keep: int) -> list[Path]:
-        manifest = self.manifest(run)
-        with name_disk_errors(home):
-            remove_orphans(home, manifest)
-            if manifest is None or len(manifest.earlier) <= keep:
-                return []
-            doomed = [home / name for name in manifest.earlier[keep:]]
-            # First the manifest forgets them: killed in between, they are orphans for the next writer.
-            shorter = replace(manifest, earlier=manifest.earlier[:keep])
-            files.replace_file(home / MANIFEST, encode_manifest(shorter))
-            for folder in doomed:
-                if folder.exists():
-                    files.remove_folder(folder)
-            point_latest(home, manifest.folder.name)
-        return doomed
+
+def list_old(manifest: Manifest) -> list[Path]:
+    """Folders of the generations of a run before the current one, the newest first."""
+    return [path for number, path in list_generations(manifest.home).items() if number < manifest.number]
 
 
 # Tables of many runs: scanned over their generations, and asked in SQL.
@@ -398,99 +414,17 @@ _RUNS_SCHEMA = pl.Schema(
 )
 
 
-def scan_table(
-    table: str, *, root: Path, manifests: Sequence[Manifest], partition: Partition | None = None
-) -> pl.LazyFrame:
-    """A table over the given generations and the results folder itself.
-
-    Tables written under another version of the contract are fitted to the present one: columns that were not
-    there are null, columns that are no more are left out.
-
-    Args:
-        table: its name.
-        root: the results folder.
-        manifests: the generations, which date each other.
-        partition: those of them to look at.
-
-    Raises:
-        StoreError: ``no_such_table``; ``file_outside`` or ``not_a_file``, a link or a pipe stands for it.
-    """
-    if table == RUNS_TABLE:
-        days = date_runs({one.run: one.start_ns for one in manifests}).days
-        rows = [one.summarize(days[one.run]) for one in _select(manifests, partition)]
-        return pl.LazyFrame(rows, schema=_RUNS_SCHEMA)
-    schema = schema_of(table)
-    present = find_contract(table.removeprefix(QUARANTINE)).version
-    current: list[Path] = []
-    others: list[Path] = []
-    for manifest in _select(manifests, partition):
-        entry = manifest.tables.get(table.removeprefix(QUARANTINE))
-        if entry is not None and f"{table}.parquet" in manifest.files:
-            path = manifest.path(table)
-            check_size(path, manifest.count_rows(table))
-            (current if entry.contract_version == present else others).append(path)
-    pooled = join_inside(root, f"{table}.parquet")
-    if pooled.exists():
-        check_size(pooled, None)
-        others.append(pooled)
-    frames = [_fit(pl.scan_parquet(path, glob=False), schema) for path in others]
-    if current:
-        frames.insert(0, pl.scan_parquet(current, glob=False))
-    return pl.concat(frames) if frames else pl.LazyFrame(schema=schema)
-
-
-def _select(manifests: Sequence[Manifest], partition: Partition | None) -> Sequence[Manifest]:
-    return manifests if partition is None else partition.select(manifests)
-
-
-def answer_query(
-    sql: str, *, root: Path, manifests: Sequence[Manifest], partition: Partition | None = None
-) -> pl.DataFrame:
-    """Answer SQL over all tables and their quarantines by name.
-
-    Args:
-        sql: the question.
-        root: the results folder.
-        manifests: the generations, which date each other.
-        partition: those of them to look at.
-
-    Raises:
-        StoreError: ``bad_query``, with what polars says about it; ``file_missing`` or ``table_damaged``, a
-            table is not what its manifest says.
-    """
-    _check_kind(sql)
-    names = [contract.name for contract in list_contracts()]
-    known = (RUNS_TABLE, *names, *(f"{QUARANTINE}{name}" for name in names))
-    # With many runs, getting every table ready takes longer than the answer: only those that are spoken of.
-    said = {word.lower() for word in re.findall(r"\w+", sql)}
-    asked = [name for name in known if name in said]
-    try:
-        scan = partial(scan_table, root=root, manifests=manifests, partition=partition)
-        return pl.SQLContext({name: scan(name) for name in asked}).execute(sql, eager=True)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, UnicodeEncodeError, OSError) as error:
-        what = str(error).partition("\n")[0]
-        hint = f"The tables are: {', '.join((RUNS_TABLE, *names))}"
-        if "no column named" in what:
-            columns = ((name, _RUNS_SCHEMA if name == RUNS_TABLE else schema_of(name)) for name in asked)
-            hint = "; ".join(f"Columns of {name}: {', '.join(schema)}" for name, schema in columns)
-        raise StoreError(
-            "bad_query", f"the query cannot be answered: {what}", where=shorten(sql), hint=hint
-        ) from error
-
-
-def _check_kind(sql: str) -> None:
-    """Refuse what is no question.
-
-    Raises:
-        StoreError: ``bad_query``.
-    """
-    if _QUESTION.match(sql) is None:
-        raise StoreError(
-            "bad_query",
-            "the query cannot be answered: it does not begin with SELECT or WITH",
-            where=shorten(sql),
-            hint="Queries read tables and never change them: SELECT run, vehicle FROM runs",
-        )
+def _list_rows(manifests: Sequence[Manifest], asked: Asked) -> list[tuple[Manifest, Mapping[str, object]]]:
+    """Runs, and their rows in the table ``runs``: of all, those that were asked for."""
+    days = date_runs({one.run: one.start_ns for one in manifests}).days
+    rows = [(one, one.summarize(days[one.run])) for one in manifests]
+    wanted = {name: text for name, text in asked.items() if text is not None}
+    begins = wanted.pop("day", "")
+    return [
+        (one, row)
+        for one, row in rows
+        if wanted.items() <= row.items() and (days[one.run] or "").startswith(begins)
+    ]
 
 
 def _fit(frame: pl.LazyFrame, schema: pl.Schema) -> pl.LazyFrame:

@@ -1,5 +1,7 @@
 """Files of results as data: one reader, which tells in one line which file is not what slip wrote."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
@@ -13,13 +15,12 @@ Kind = TypeVar("Kind")
 AGAIN: Final = "Analyze the log again with --force; `slip results verify` lists what else is damaged"
 
 
-def read_stored(path: Path, kind: type[Kind], *, hint: str = AGAIN) -> Kind:
+def read_stored(path: Path, kind: type[Kind]) -> Kind:
     """The content of a JSON file of results.
 
     Args:
         path: the file.
         kind: the type of its content.
-        hint: how to make the file again.
 
     Raises:
         StoreError: ``file_damaged``, it is not of that type; ``too_large``, ``no_folder`` and others of
@@ -27,45 +28,42 @@ def read_stored(path: Path, kind: type[Kind], *, hint: str = AGAIN) -> Kind:
     """
     with name_disk_errors(path):
         data = read_bounded(path)
-    return decode_stored(data, kind, path, hint=hint)
+    return decode_stored(data, kind, path)
 
 
-def decode_stored(data: bytes, kind: type[Kind], path: Path, *, hint: str = AGAIN) -> Kind:
+def decode_stored(data: bytes, kind: type[Kind], path: Path) -> Kind:
     """The content of such a file that was read.
 
     Raises:
         StoreError: ``file_damaged``.
     """
-    try:
+    with _name_damage(path):
         return msgspec.json.decode(data, type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise _damaged(error, path, hint) from error
 
 
-def convert_stored(
-    content: object, kind: type[Kind], path: Path, *, hint: str = AGAIN, strict: bool = True
-) -> Kind:
+def convert_stored(content: object, kind: type[Kind], path: Path, *, strict: bool = True) -> Kind:
     """An object of such a file as a type.
 
     Args:
         content: the object.
         kind: the type.
         path: the file.
-        hint: how to make the file again.
         strict: whether a text or a truth value is no number.
 
     Raises:
         StoreError: ``file_damaged``.
     """
-    try:
+    with _name_damage(path):
         return msgspec.convert(content, kind, strict=strict)
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise _damaged(error, path, hint) from error
 
 
-def _damaged(error: Exception, path: Path, hint: str) -> StoreError:
-    what = f"the file is not what this version of slip writes: {shorten(' '.join(str(error).split()))}"
-    return StoreError("file_damaged", what, where=str(path), hint=hint)
+@contextmanager
+def _name_damage(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        what = f"the file is not what this version of slip writes: {shorten(' '.join(str(error).split()))}"
+        raise StoreError("file_damaged", what, where=str(path), hint=AGAIN) from error
 
 
 # The shape of a run's stored summary, against which it is held when it is read.

@@ -7,16 +7,19 @@ import json
 import os
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from stat import S_ISDIR
 
 from pipeline.core import SlipError, guess_names, resolve_inside
 from pipeline.logs import RemotePath, list_files, locate_recorded, spell_location, stem_of, to_location
-from pipeline.store.files import JSON, Manifest, hash_bytes
+from pipeline.store.files import hash_bytes
+from pipeline.store.manifests import JSON, Manifest
 from pipeline.store.names import StoreError, encode_run, no_results
-from pipeline.store.results_folder import RUNS, Store
+from pipeline.store.results_folder import Store
 from pipeline.store.stored_files import SUMMARY
+from pipeline.store.verification import RUNS
 
 
 def name_plainly(path: Path) -> str:
@@ -178,7 +181,7 @@ def read_length_scale(manifest: Manifest) -> float:
 
 
 WORKBENCH = "workbench"
-"""Folder in the results for data of the workbench: sessions, models and requested diagnoses."""
+"""Folder in the results for data of the workbench: models, requested diagnoses and dropped logs."""
 
 
 UPLOADS = f"{WORKBENCH}/uploads"
@@ -287,22 +290,15 @@ class LogIdentities:
             return None
         return str(sha256) if then.is_same_file(now) else None
 
-    def remember(self, path: Path, sha256: str, *, seen: LogSighting | None = None) -> bool:
-        """Remember the hash of a log; failing to is no error.
+    def remember(self, path: Path, sha256: str, *, seen: LogSighting) -> None:
+        """Remember the hash of a log that did not change while it was read; failing to is no error.
 
         Args:
             path: the log.
             sha256: its hash in hexadecimal.
-            seen: what `see_log` said before the log was read; with it, a log that changed while it was read
-                is not remembered.
-
-        Returns:
-            Whether it was remembered.
+            seen: what `see_log` said before the log was read.
         """
-        try:
+        with suppress(OSError):
             now = see_log(path)
-            if seen is not None and not (seen.is_same_file(now) and seen.seen_ns - seen.mtime_ns > _TICK_NS):
-                return False
-        except OSError:
-            return False
-        return self._notes.write(now.path, {**asdict(now), "sha256": sha256})
+            if seen.is_same_file(now) and seen.seen_ns - seen.mtime_ns > _TICK_NS:
+                self._notes.write(now.path, {**asdict(now), "sha256": sha256})

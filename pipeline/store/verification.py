@@ -1,22 +1,23 @@
 """Are the results still what was written?"""
 
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.core import TooLargeError, read_bounded, walk_files
-from pipeline.store.checksums import NOTES, decode_checked, parse_manifest
-from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_file
+from pipeline.store.checksums import NOTES, decode_checked
+from pipeline.store.files import hash_file
 from pipeline.store.generation import LATEST
-from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
+from pipeline.store.manifests import MANIFEST, load_manifest
+from pipeline.store.names import GENERATION, Sample, StoreError, Tally, check_home, is_file_name
 
 RUNS = "runs"
 _RUN_DEPTHS = (1, 2)
 """Slashes in the folder of a run, ``runs/stem`` or ``runs/folder/stem``."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Problem:
     """One file that cannot be trusted.
 
@@ -53,159 +54,117 @@ class Examination:
     files: Tally = field(default_factory=Tally)
 
 
-class DiskFiles:
-    """The files of a results folder.
-
-    Args:
-        root: the folder.
-    """
-
-    def __init__(self, root: Path) -> None:
-        self._root = root
-
-    def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
-        """Every name in the results; links are not followed.
-
-        Args:
-            skip: told of each folder that is left out, and why.
-        """
-        start = len(str(self._root)) + 1
-        return {entry.path[start:] for entry in walk_files(self._root, skip)}
-
-    def read(self, name: str) -> bytes | None:
-        """The content of a file; None when there is none."""
-        path = self.locate(name)
-        try:
-            return read_bounded(path) if path.is_file() else None
-        except FileNotFoundError:
-            return None
-
-    def hash(self, name: str) -> str:
-        """SHA-256 of a file in hexadecimal; empty when there is none."""
-        path = self.locate(name)
-        try:
-            return "" if path.is_symlink() or not path.is_file() else hash_file(path)
-        except FileNotFoundError:
-            return ""
-
-    def locate(self, name: str) -> Path:
-        """The path to show."""
-        return self._root / name
-
-
-def examine_files(files: DiskFiles, *, sample: Sample | None = None) -> Examination:
+def examine_results(root: Path, sample: Sample | None = None) -> Examination:
     """Read the current results of all runs again, and hold them against their manifests.
 
     Older generations are not looked at: nobody reads them any more.
 
     Args:
-        files: the results.
+        root: the results folder.
         sample: of the files, those that are hashed; None for all.
     """
-    return _Examiner(files, sample).examine()
+    return _Examiner(root, sample).examine()
 
 
 class _Examiner:
-    def __init__(self, files: DiskFiles, sample: Sample | None) -> None:
-        self._files = files
+    def __init__(self, root: Path, sample: Sample | None) -> None:
+        self._root, self._sample, self._tally = root, sample, Tally()
         self._unread: list[Problem] = []
-        self._names = files.names(self._leave_out)
-        self._sorted = sorted(self._names)
-        self._sample, self._tally = sample, Tally()
+        start = len(str(root)) + 1
+        self._names = sorted(entry.path[start:] for entry in walk_files(root, self._leave_out))
 
     def examine(self) -> Examination:
         problems = list(self._unread)
-        # A run has a link to its results only when it had a manifest.
-        for home in sorted(self._find_run_folders(MANIFEST) | self._find_run_folders(LATEST)):
-            problems += [replace(problem, home=home) for problem in self._examine_run(home)]
+        for home in self._list_runs():
+            problems += self._examine_run(home)
         problems += self._examine_notes()
-        of_all = {name for name in self._names if is_file_name(name) and "/" not in name}
-        return Examination(problems=tuple(problems), unchecked=tuple(sorted(of_all)), files=self._tally)
+        of_all = tuple(name for name in self._names if is_file_name(name) and "/" not in name)
+        return Examination(problems=tuple(problems), unchecked=of_all, files=self._tally)
 
     def _leave_out(self, path: Path, why: str) -> None:
         self._unread.append(Problem(run="", path=path, code="left_out", what=why))
 
-    def _find_run_folders(self, name: str) -> set[str]:
-        """Folders of runs that hold a name."""
-        folders = {path.removesuffix(f"/{name}") for path in self._names if path.endswith(f"/{name}")}
-        # A generation's folder may hold a file of any name, and runs may stand beside it.
-        return {
-            home
-            for home in folders
-            if home.startswith(f"{RUNS}/")
-            and home.count("/") in _RUN_DEPTHS
-            and f"{home}/{MARKER}" not in self._names
-        }
+    def _list_runs(self) -> list[str]:
+        """Folders of runs, which have a manifest, or a link that only those with one had."""
+        parts = [name.rpartition("/") for name in self._names if name.startswith(f"{RUNS}/")]
+        return sorted(
+            {
+                home
+                for home, _, name in parts
+                if name in (MANIFEST, LATEST)
+                and home.count("/") in _RUN_DEPTHS
+                and not GENERATION.fullmatch(home.rpartition("/")[2])
+            }
+        )
 
     def _examine_run(self, home: str) -> list[Problem]:
         """Problems of a run; looked at again when somebody has written it meanwhile."""
-        name, run = f"{home}/{MANIFEST}", home.removeprefix(f"{RUNS}/")
         while True:
-            try:
-                data = self._files.read(name)
-                problems = [*self._judge_run(run, home, data)]
-                if not problems or self._files.read(name) == data:
-                    return problems
-            except OSError as error:
-                code = "manifest_damaged" if isinstance(error, TooLargeError) else "disk_error"
-                return [self._problem(run, name, code, _format_os_error(error))]
+            before = self._identify(home)
+            problems = [*self._judge_run(home)]
+            if not problems or self._identify(home) == before:
+                return problems
 
-    def _judge_run(self, run: str, home: str, data: bytes | None) -> Iterator[Problem]:
-        name = f"{home}/{MANIFEST}"
-        if data is None:
-            yield self._problem(run, name, "run_missing", "the manifest of the run is gone")
-            return
-        path = self._files.locate(home)
+    def _identify(self, home: str) -> tuple[int, int] | None:
         try:
-            manifest = parse_manifest(data, path)
-        except StoreError as error:
-            yield self._problem(run, home, error.code, str(error))
-            return
-        try:
-            check_home(manifest.run, path, top=self._files.locate(RUNS))
-        except StoreError as error:
-            yield self._problem(run, name, error.code, error.what)
-            return
-        yield from self._compare(manifest, f"{home}/{manifest.folder.name}")
+            status = (self._root / home / MANIFEST).stat()
+        except OSError:
+            return None
+        return status.st_ino, status.st_mtime_ns
 
-    def _compare(self, manifest: Manifest, folder: str) -> Iterator[Problem]:
-        """Files of the current generation that are gone, changed, or more than were written."""
-        expected = {f"{folder}/{name}": sha256 for name, sha256 in manifest.hashes().items()}
-        start = bisect_left(self._sorted, f"{folder}/")
-        inside = self._sorted[start : bisect_left(self._sorted, f"{folder}0", start)]
-        for path in inside:
-            if path not in expected and path != f"{folder}/{MARKER}":
-                what = "the file was not written with the others"
-                yield self._problem(manifest.run, path, "extra_file", what)
-        for path, sha256 in expected.items():
-            if not self._tally.draws(self._sample, path) and path in self._names:
-                continue
-            try:
-                digest = self._files.hash(path)
-            except OSError as error:
-                yield self._problem(manifest.run, path, "disk_error", _format_os_error(error))
-                continue
-            if not digest:
-                yield self._problem(manifest.run, path, "file_missing", "the file is gone")
-            elif digest != sha256:
-                what = "the file has changed since it was written"
-                yield self._problem(manifest.run, path, "file_damaged", what)
+    def _judge_run(self, home: str) -> Iterator[Problem]:
+        """What is wrong with a manifest; else files that are gone, changed, or more than were written."""
+        run, path = home.removeprefix(f"{RUNS}/"), self._root / home
+        try:
+            manifest = load_manifest(path)
+            if manifest is None:
+                yield Problem(run, path / MANIFEST, "run_missing", "the manifest of the run is gone", home)
+                return
+            check_home(manifest.run, path, top=self._root / RUNS)
+        except OSError as error:
+            code = "manifest_damaged" if isinstance(error, TooLargeError) else "disk_error"
+            yield Problem(run, path / MANIFEST, code, _format_os_error(error), home)
+            return
+        except StoreError as error:
+            yield Problem(run, path / MANIFEST, error.code, error.what, home)
+            return
+        folder = f"{home}/{manifest.folder.name}"
+        start = bisect_left(self._names, f"{folder}/")
+        inside = self._names[start : bisect_left(self._names, f"{folder}0", start)]
+        extra = {name.removeprefix(f"{folder}/") for name in inside} - manifest.files.keys()
+        checked = [(name, "extra_file", "the file was not written with the others") for name in sorted(extra)]
+        for name, entry in sorted(manifest.files.items()):
+            path, is_there = manifest.folder / name, f"{folder}/{name}" in inside
+            checked.append((name, *self._judge_file(path, entry.sha256, is_there=is_there)))
+        for name, code, what in checked:
+            if code:
+                yield Problem(manifest.run, manifest.folder / name, code, what, home)
+
+    def _judge_file(self, path: Path, sha256: str, *, is_there: bool) -> tuple[str, str]:
+        """Code and what is wrong with a file of a run; empty where it is not drawn, or as it was written."""
+        if not self._tally.draws(self._sample, str(path.relative_to(self._root))) and is_there:
+            return "", ""
+        try:
+            if path.is_symlink() or not path.is_file():
+                return "file_missing", "the file is gone"
+            is_same = hash_file(path) == sha256
+        except OSError as error:
+            return "disk_error", _format_os_error(error)
+        return ("", "") if is_same else ("file_damaged", "the file has changed since it was written")
 
     def _examine_notes(self) -> Iterator[Problem]:
-        for name in sorted(name for name in self._names if name.startswith(NOTES) and name.endswith(".json")):
-            if not self._tally.draws(self._sample, name):
+        for name in self._names:
+            if not (name.startswith(NOTES) and name.endswith(".json")):
+                continue
+            path = self._root / name
+            if not self._tally.draws(self._sample, name) or not path.is_file():
                 continue
             try:
-                data = self._files.read(name)
-                if data is not None:
-                    decode_checked(data)
+                decode_checked(read_bounded(path))
             except (ValueError, OSError) as error:
                 why = getattr(error, "strerror", None) or error
                 what = f"the note is damaged and is not used ({why}); this costs nothing but time"
-                yield self._problem("", name, "note_damaged", what)
-
-    def _problem(self, run: str, name: str, code: str, what: str) -> Problem:
-        return Problem(run=run, path=self._files.locate(name), code=code, what=what)
+                yield Problem("", path, "note_damaged", what)
 
 
 def _format_os_error(error: OSError) -> str:

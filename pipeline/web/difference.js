@@ -31,7 +31,7 @@ export const showDifference = (place, one, other) => {
 };
 
 const listNumbers = (a, b) => {
-  const numbers = (session) => new Map(session.effects.filter((effect) => !effect.off).flatMap((effect) =>
+  const numbers = (session) => new Map(session.effects.flatMap((effect) =>
     effect.parameters.map(({ name, unit, value, about }) => [`${effect.id}: ${about || name}${unit === "1" ? "" : setSquares(` [${unit}]`)}`, value])));
   const [first, second] = [numbers(a), numbers(b)];
   return [...new Set([...first.keys(), ...second.keys()])].map((name) => [name, first.get(name) ?? null, second.get(name) ?? null]);

@@ -1,6 +1,5 @@
 // The model of a session: its effects as cards, and what to add next, one row an effect.
 import { h, say, sayAngle, sayLength, sayShare, setSquares } from "./parts.js";
-import { buildPlan } from "./plan.js";
 
 const REST_MS = 350;
 const FIRST_ROWS = 4;
@@ -58,15 +57,14 @@ const buildReach = (pane, next) => {
     : [h("span", { class: session.done ? "done" : "" }, session.remains)]));
 };
 
-const addRow = (pane, row) => (row.named && row.formula.length ? pane.addFound() : pane.add(row.id));
+const addRow = (pane, row) => pane.add(row.id);
 
 // Cards -----------------------------------------------------------------------------------------------------
 
 const buildCard = (pane, effect) => {
-  const carries = effect.without_m !== null && !effect.off ? effect.without_m - pane.state.session.errors.t : null;
+  const carries = effect.without_m !== null ? effect.without_m - pane.state.session.errors.t : null;
   const cause = effect.sentence.split(CAUSE)[1];
-  const [turn, told] = effect.off ? ["Switch on", "switch it on again with its present values"] : ["Switch off", "switch it off without a new fit"];
-  return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
+  return h("li", { class: "card", tabindex: "-1", data: { effect: effect.id } },
     h("b", { class: "name" }, nameEffect(effect)), h("p", { class: "quiet id" }, effect.id),
     effect.formula.length ? h("p", { class: "quiet about" }, sayInputs(effect)) : h("p", { class: "quiet about" }, lead(effect.about)),
     cause && h("p", { class: "quiet" }, `Cause: ${cause}`),
@@ -74,7 +72,6 @@ const buildCard = (pane, effect) => {
     effect.parameters.map((parameter) => buildSlider(pane, effect, parameter)),
     h("div", { class: "head" },
       carries !== null && carries > 0 && h("span", { class: "carries" }, `without it ${sayLength(effect.without_m)}`),
-      h("button", { type: "button", class: "switch", "aria-pressed": String(!effect.off), "aria-label": `${turn.toLowerCase()} ${effect.id}: ${told}`, title: told, data: { keep: `switch ${effect.id}` }, onclick: () => pane.act("switch", { effect: effect.id }) }, turn),
       h("button", { type: "button", class: "remove", title: "remove it and fit the rest", "aria-label": `remove ${effect.id} and fit the rest`, onclick: () => pane.act("drop", { effect: effect.id }) }, "Remove")));
 };
 
@@ -89,7 +86,6 @@ const buildSlider = (pane, effect, parameter) => {
     value: String(value), "aria-label": `${label} [${unit}], ${parameter.about}`, "aria-valuetext": words(value), data: { keep: label },
   });
   input.value = String(value);
-  input.disabled = effect.off;
   input.addEventListener("input", () => {
     shown.textContent = words(Number(input.value));
     input.setAttribute("aria-valuetext", shown.textContent);
@@ -163,7 +159,7 @@ const buildNext = (pane) => {
     trial?.done && !next && !(session.done && rows.length > 0) && h("p", { class: session.done ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
-    undecided, rest, buildPlan(pane),
+    undecided, rest,
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
 };
 

@@ -133,7 +133,7 @@ const showJobs = (jobs) => {
     job.error && h("p", {}, job.error.message),
     job.error && askVehicle(job),
     job.run && h("button", { type: "button", onclick: () => open_(job.run) }, job.lossy ? "Open (log had losses)" : "Open"),
-    (job.done || job.stops) && h("button", { type: "button", class: "drop", title: job.done ? "close this notice" : "cancel", "aria-label": job.done ? `close the notice of ${job.name}` : `cancel the ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
+    h("button", { type: "button", class: "drop", title: job.done ? "close this notice" : "cancel", "aria-label": job.done ? `close the notice of ${job.name}` : `cancel the ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
   for (const job of jobs) if (job.done && job.run && !job.error && !leaving.has(job.id)) leaving.set(job.id, setTimeout(() => dismiss(job).catch(() => {}), NOTICE_MS));
   if (focus) find("jobs").querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };
@@ -232,7 +232,6 @@ let width = document.documentElement.clientWidth;
 const again = () => {
   clearTimeout(timer);
   timer = setTimeout(() => Object.values(panes).forEach((pane) => {
-    pane?.planned?.paint?.();
     pane?.paintAnew();
     repaintDifference(find("apart"));
   }), 200);

@@ -327,12 +327,7 @@ export class Pane {
 
   // The joint fit of the diagnosis, as one step that can be undone.
   async addAll() {
-    if (await this.act("add_named")) this.tryAll();
-  }
-
-  // The formula that the diagnosis found for what no effect explains.
-  async addFound() {
-    if (await this.act("add_found")) this.tryAll();
+    if (await this.act("add", { effects: this.state.missing })) this.tryAll();
   }
 
   async tryAll(anyway = false) {
@@ -508,7 +503,6 @@ export class Pane {
   async paintAnew() {
     if (!this.plots) return;
     for (const place of this.root.querySelectorAll(".plot[data-figure]")) {
-      if (!(place.dataset.figure in this.album.figures)) continue; // a planned drive is drawn by itself
       if (place.clientWidth) await this.plots.draw(place);
       else if (place.classList.contains("drawn")) {
         this.plots.forget(place.dataset.figure);

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
         describe_rest,
         describe_unexplained,
         format_remaining_error,
-        format_step,
         name_span,
     )
     from pipeline.words.models import (

@@ -141,7 +141,7 @@ def describe_separation(item: Undecided) -> str:
 
 
 def suggest_drive(*names: str) -> str:
-    """Manoeuvres that excite effects; nothing for those that only an earlier version knew."""
+    """Manoeuvres that excite effects; nothing for those that are not loaded."""
     known = _list_known()
     return suggest_manoeuvre(*(known[name]() for name in names if name in known))
 

@@ -80,7 +80,7 @@ def format_step(errors: Errors) -> str:
 
 
 def name_region(region: Region) -> str:
-    """A region in words; empty for one of an earlier version."""
+    """A region in words; empty where a stored diagnosis names none of those there are."""
     return REGIONS.get(region.id, "").format(*region.limits)
 
 

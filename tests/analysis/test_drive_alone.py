@@ -26,7 +26,7 @@ from pipeline.models.effect import Place
 from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.simulate import Encoders, Recording, Scenario, make_scenario, simulate_run, write_log
 from pipeline.simulate.facts import find_layout
-from pipeline.simulate.topics import list_topics
+from pipeline.simulate.messages import list_topics
 from pipeline.sources import find_preset
 from pipeline.store import Manifest, Store
 from pipeline.words.objects import diagnosis_as_json

@@ -9,7 +9,7 @@ from verbs import ask_verb
 import slip
 from pipeline.cli.screen import format_run
 from pipeline.results import RunDiagnosis, read_result
-from pipeline.web.stored_runs import summarize_run as describe_in_workbench
+from pipeline.web.runs import summarize_run as describe_in_workbench
 from pipeline.words.diagnosis import describe
 from pipeline.words.verdict import format_verdict
 

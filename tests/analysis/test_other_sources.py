@@ -19,7 +19,7 @@ from pipeline.core import SlipError
 from pipeline.logs import definition_text, open_log
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.simulate.facts import Published, Q
-from pipeline.simulate.topics import Fields, imu, joints, odometry, twist
+from pipeline.simulate.messages import Fields, imu, joints, odometry, twist
 from pipeline.sources import load_configuration
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")

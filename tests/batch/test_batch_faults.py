@@ -6,14 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from batch_tools import batch, read_tables
+from batch_tools import assert_whole, batch, read_tables
 
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
 pytest.importorskip("_testcapi", reason="this Python cannot refuse memory on purpose")
-
-from collections.abc import Mapping
 
 from faults import DISK, MEMORY, Fault, arm, draw_faults
 
@@ -45,20 +43,6 @@ def batch_under(fault: Fault, field: Path, out: Path) -> None:
     sys.exit(FAILED if outcome.has_failed else FINISHED)
 
 
-def assert_whole(out: Path, undisturbed: Mapping[str, bytes], fault: Fault) -> None:
-    store = Store(out)
-    assert store.examine().problems == (), fault
-    for manifest in store.manifests():
-        home = manifest.folder.parent.relative_to(out).as_posix()
-        for name in manifest.tables:
-            expected = next(
-                content
-                for path, content in undisturbed.items()
-                if path.startswith(f"{home}/") and path.endswith(f"/{name}.parquet")
-            )
-            assert manifest.path(name).read_bytes() == expected, fault
-
-
 # Beside the test of the store that meets the same faults.
 @pytest.mark.long
 def test_memory_and_disk_fail(field: Path, tmp_path: Path) -> None:
@@ -74,12 +58,12 @@ def test_memory_and_disk_fail(field: Path, tmp_path: Path) -> None:
         process.join(PATIENCE_S)
         process.kill()
         process.join()
-        assert_whole(out, undisturbed, fault)
+        assert_whole(out, undisturbed)
         outcomes.append(process.exitcode)
     assert outcomes.count(FINISHED) < ROUNDS, "faults were met"
     assert FAILED in outcomes
     last = batch(field, out)
     assert not last.problems
     assert len(Store(out).runs()) == 2
-    assert_whole(out, undisturbed, Fault("none", 0))
+    assert_whole(out, undisturbed)
     assert read_tables(out)["datasets.parquet"] == undisturbed["datasets.parquet"]

@@ -12,14 +12,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import polars as pl
 import pytest
-from batch_tools import IMPORTABLE, batch, counts, read_tables, start_slip
-from batch_works import work_dying_at_steps
+from batch_tools import IMPORTABLE, assert_whole, batch, counts, read_tables, start_slip
+from batch_works import work_dying
 
-from pipeline.store import STEPS, Store
-
-ROUNDS = 100
+from pipeline.store import Store, list_old
 
 
 @pytest.fixture(scope="module")
@@ -39,34 +36,51 @@ def undisturbed(field: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     return read_tables(out)
 
 
-def assert_whole(out: Path, undisturbed: dict[str, bytes]) -> None:
-    """Whatever readers see is whole, and what it will be at the end."""
-    store = Store(out)
-    assert store.examine().problems == ()
-    for manifest in store.manifests():
-        for name in manifest.files:
-            path = manifest.path(name)
-            assert path.read_bytes() == undisturbed[str(path.relative_to(out))]
-    assert store.scan("slip").select(pl.len()).collect().item() >= 0
+def start_batch(field: Path, out: Path) -> Callable[[], None]:
+    """A batch in a process of its own, without workers."""
+    # A server that has loaded everything forks the batches: no round is spent on starting a program.
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(
+        ["pytest", "pipeline.batch.batch_run", "pipeline.analysis.analyze", "pipeline.report.page"]
+    )
+    process = server.Process(target=batch, args=(field, out))
+    process.start()
+
+    def kill() -> None:
+        process.kill()
+        process.join()
+
+    return kill
 
 
-def kill_at_random(
+def start_command(field: Path, out: Path) -> Callable[[], None]:
+    """The command, with two workers."""
+    process = start_slip("batch", field, "--results", out, "--jobs", "2", "--settle", "0", "--quiet")
+
+    def kill() -> None:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+    return kill
+
+
+# Beside the test of the store that kills at random moments.
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("start", "rounds", "longest_s"), [(start_batch, 100, 3.0), (start_command, 16, 12.0)]
+)
+def test_killed_at_random_moments(
     field: Path,
-    out: Path,
+    tmp_path: Path,
     undisturbed: dict[str, bytes],
-    start: Callable[[], Callable[[], None]],
-    *,
+    start: Callable[[Path, Path], Callable[[], None]],
     rounds: int,
     longest_s: float,
-) -> Counter[int]:
-    """Rounds by how many runs were published when the batch was killed.
-
-    ``start`` begins a batch and gives what kills it.
-    """
-    chance = random.Random(rounds)  # noqa: S311 - moments, not secrets
+) -> None:
+    out, chance = tmp_path / "out", random.Random(rounds)  # noqa: S311 - moments, not secrets
     seen: Counter[int] = Counter()
     for _ in range(rounds):
-        kill = start()
+        kill = start(field, out)
         time.sleep(chance.uniform(0.0, longest_s))
         kill()
         assert_whole(out, undisturbed)
@@ -74,109 +88,47 @@ def kill_at_random(
         if len(Store(out).runs()) == len(list(field.glob("*.mcap"))):
             # Everything is done: begin again, so that every round has something to kill.
             shutil.rmtree(out)
-    return seen
-
-
-def assert_finished(field: Path, out: Path, undisturbed: dict[str, bytes]) -> None:
+    assert len(seen) > 1, "batches were killed while they published"
     batch(field, out)
     assert read_tables(out) == undisturbed
     # Killed behind its last step a run is done: only the link `latest`, a convenience, may have been left.
     assert all(path.is_symlink() for path in out.glob("runs/*/*/.tmp-*"))
 
 
-# Beside the test of the store that kills at random moments.
-@pytest.mark.long
-def test_killed_at_random_moments(field: Path, tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
-    # A server that has loaded everything forks the batches: no round is spent on starting a program.
-    server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(
-        ["pytest", "pipeline.batch.batch_run", "pipeline.analysis.analyze", "pipeline.report.page"]
-    )
-    # The first process waits for the server.
-    for target, given in ((time.sleep, (0.0,)), (batch, (field, tmp_path / "timed"))):
-        started = time.monotonic()
-        whole = server.Process(target=target, args=given)
-        whole.start()
-        whole.join()
-        longest_s = time.monotonic() - started
-    out = tmp_path / "out"
-
-    def start() -> Callable[[], None]:
-        process = server.Process(target=batch, args=(field, out))
-        process.start()
-
-        def kill() -> None:
-            process.kill()
-            process.join()
-
-        return kill
-
-    seen = kill_at_random(field, out, undisturbed, start, rounds=ROUNDS, longest_s=longest_s)
-    assert len(seen) > 2, "batches were killed while they published"
-    assert_finished(field, out, undisturbed)
+CALLS = tuple(range(1, 40))
+"""More calls of the system that change the disk than the work on a log does."""
 
 
-@pytest.mark.long
-def test_whole_commands_killed_with_their_workers_at_random_moments(
-    field: Path, tmp_path: Path, undisturbed: dict[str, bytes]
-) -> None:
-    command = ("batch", field, "--jobs", "2", "--settle", "0", "--quiet", "--results")
-    started = time.monotonic()
-    start_slip(*command, tmp_path / "timed").communicate()
-    longest_s = time.monotonic() - started
-    out = tmp_path / "out"
-
-    def start() -> Callable[[], None]:
-        process = start_slip(*command, out)
-
-        def kill() -> None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-
-        return kill
-
-    seen = kill_at_random(field, out, undisturbed, start, rounds=16, longest_s=longest_s)
-    assert len(seen) > 1, "batches were killed while they published"
-    assert_finished(field, out, undisturbed)
-
-
-def name_logs_after_steps(originals: Path, folder: Path, steps: Sequence[str] = STEPS) -> None:
+def name_logs_after_calls(originals: Path, folder: Path, calls: Sequence[int]) -> None:
     folder.mkdir()
     whole = (originals / "a.mcap").read_bytes()
-    for number, step in enumerate(steps):
-        (folder / f"{step}.mcap").write_bytes(whole + bytes(number + 1))
+    for call in calls:
+        (folder / f"{call}.mcap").write_bytes(whole + bytes(call))
 
 
-# Beside the tests of the store, which kill at every step: before, at and behind the step that publishes.
+# Beside the tests of the store, which kill at every call.
 @pytest.mark.parametrize(
-    "steps",
-    [
-        ("file_written", "manifest_written", "latest_replaced"),
-        pytest.param(STEPS, marks=pytest.mark.long),
-    ],
-    ids=["some", "all"],
+    "calls", [(4, 20, 27), pytest.param(CALLS, marks=pytest.mark.long)], ids=["some", "all"]
 )
-def test_a_worker_killed_at_steps_of_a_commit_costs_nothing(
-    originals: Path, tmp_path: Path, steps: tuple[str, ...]
+def test_a_worker_killed_at_any_call_costs_nothing(
+    originals: Path, tmp_path: Path, calls: tuple[int, ...]
 ) -> None:
     season = tmp_path / "season"
-    name_logs_after_steps(originals, season, steps)
+    name_logs_after_calls(originals, season, calls)
     batch(season, tmp_path / "clean")
-    outcome = batch(season, tmp_path / "out", work=work_dying_at_steps, executor="local")
-    assert len(list(season.glob("*.killed"))) == len(steps)
-    # Behind the last steps the results are there already when the log is tried again.
-    assert sum(counts(outcome).get(state, 0) for state in ("done", "lossy", "unchanged")) == len(steps)
+    outcome = batch(season, tmp_path / "out", work=work_dying, executor="local")
+    assert len(list(season.glob("*.killed"))) >= min(len(calls), 25)
+    # Behind the last calls the results are there already when the log is tried again.
+    assert sum(counts(outcome).get(state, 0) for state in ("done", "lossy", "unchanged")) == len(calls)
     assert not outcome.problems
     assert read_tables(tmp_path / "out") == read_tables(tmp_path / "clean")
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("step", STEPS)
-def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
-    originals: Path, tmp_path: Path, step: str
-) -> None:
+@pytest.mark.parametrize("call", CALLS[:27:3])
+def test_a_batch_killed_with_all_its_workers_goes_on(originals: Path, tmp_path: Path, call: int) -> None:
     season = tmp_path / "season"
-    name_logs_after_steps(originals, season)
+    name_logs_after_calls(originals, season, (call, 50, 60))
     batch(season, tmp_path / "clean")
     code = (
         "import sys; from pathlib import Path; from batch_tools import batch; from batch_works import *;"
@@ -185,7 +137,7 @@ def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
     process = subprocess.Popen(
         [sys.executable, "-c", code, season, tmp_path / "out"],
         start_new_session=True,
-        env=os.environ | {"DIE_AT": step, "PYTHONPATH": IMPORTABLE},
+        env=os.environ | {"DIE_AT": str(call), "PYTHONPATH": IMPORTABLE},
     )
     assert process.wait(60) == -signal.SIGKILL
     assert Store(tmp_path / "out").examine().problems == ()
@@ -232,4 +184,4 @@ def test_two_batches_at_once_do_every_log_once(
     answers = [process.communicate(timeout=120) for process in both]
     assert [process.returncode for process in both] == [3, 3], answers
     assert read_tables(out) == undisturbed
-    assert all(manifest.earlier == () for manifest in Store(out).manifests())
+    assert not any(list_old(manifest) for manifest in Store(out).manifests())

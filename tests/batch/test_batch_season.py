@@ -12,7 +12,7 @@ from pipeline.analysis.work import VERSIONS
 from pipeline.batch import Pruning, Shard, batch_plan
 from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.batch_run import run_batch
-from pipeline.store import Store
+from pipeline.store import Store, list_old
 
 
 def hash_all(folder: Path) -> dict[str, str]:
@@ -123,7 +123,7 @@ def test_a_changed_log_takes_the_place_of_the_old_one(season: Path, tmp_path: Pa
     )
     manifest = Store(out).manifest("season/c")
     assert manifest is not None
-    assert len(manifest.earlier) == 1
+    assert len(list_old(manifest)) == 1
 
 
 def test_logs_of_one_name_get_runs_of_their_own(season: Path, tmp_path: Path) -> None:

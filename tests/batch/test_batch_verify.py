@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from batch_tools import batch, counts, read_tables
+from store_samples import read_current
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -42,7 +43,7 @@ def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path:
     assert {actions[f"season/{name}"] for name in "abcd"} == {"queued"}
     assert all(str(season) in repair.what for repair in found.repairs if "season" in repair.subject)
     # What may still be of use is there until something better is.
-    assert Store(out).read("season/a", "aggregates").height
+    assert read_current(Store(out), "season/a", "aggregates").height
 
     again = batch(season, out)
     assert counts(again) == {"done": 4}

@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 from comparison_store import Run, write_run
+from store_samples import read_current
 
 from pipeline.datasets.compare import Answer, compare_results
 from pipeline.datasets.compared_runs import Question
@@ -107,7 +108,7 @@ def test_measures_of_difficulty_have_their_definition(store: Store) -> None:
     assert 1.0 / 2.3 < row["relative_slip"] < 1.0 / 0.5
     assert row["height_rate"] is None
     # Slip goes 1 m/s sideways and ahead while the vehicle drives at |v|: a path over a path.
-    slip = store.read("one", "slip").filter(pl.col("input") == "command")
+    slip = read_current(store, "one", "slip").filter(pl.col("input") == "command")
     turning = (1.08**2 + 0.914**2) / 12.0 * slip["v_w"] ** 2
     driven = (slip["v_x"] ** 2 + slip["v_y"] ** 2 + turning).sqrt()
     assert row["lost_energy"] == pytest.approx(slip.height / driven.sum())
@@ -213,7 +214,7 @@ def test_features_can_be_given_away_and_put_together(store: Store) -> None:
     path = store.root / "features.parquet"
     assert b"secret_farm" not in path.read_bytes()
     features = pl.read_parquet(path)
-    aggregates = store.read("secret_farm/0", "aggregates").filter(
+    aggregates = read_current(store, "secret_farm/0", "aggregates").filter(
         pl.col("input") == "command", pl.col("subset") == "all"
     )
     own = features.filter(pl.col("sha256") == "0" * 64, pl.col("input") == "command")

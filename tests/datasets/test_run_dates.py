@@ -7,7 +7,7 @@ from comparison_store import Run, write_run
 
 from pipeline.datasets.compared_runs import find_material
 from pipeline.report import format_date, render_catalogue
-from pipeline.store import Partition, Store
+from pipeline.store import Store
 from pipeline.store.names import date_runs, read_day
 
 PLACEHOLDER = 1_700_000_000_000_000_000
@@ -72,11 +72,11 @@ def test_the_table_of_runs_the_list_of_runs_and_a_report_have_the_dates_of_the_t
     page = render_catalogue(store)
     assert "2024-07-30" in page
     assert "2023-11-14" not in page
-    assert store.scan("runs", Partition(day="2024-07")).collect()["run"].to_list() == ["ice_2024_7_30"]
-    assert store.scan("runs", Partition(day="2023-11")).collect().is_empty()
+    assert store.scan("runs", asked={"day": "2024-07"}).collect()["run"].to_list() == ["ice_2024_7_30"]
+    assert store.scan("runs", asked={"day": "2023-11"}).collect().is_empty()
     # A question about one vehicle gives a run the date that it has among all.
     write_run(store, Run(name="moss", vehicle="jackal", start_ns=PLACEHOLDER))
-    jackal = Partition(vehicle="jackal")
+    jackal = {"vehicle": "jackal"}
     assert store.query("SELECT run, day FROM runs", jackal).rows() == [("moss", None)]
     # So does a comparison that leaves the run out whose name contradicts the clock.
     write_run(

@@ -36,7 +36,6 @@ WHOLE = frozenset({"more", "cells", "larger", "smaller", "tested", "left_out"})
 """Words that are no name alone, but fit as a part of one (`list_cells` of a table)."""
 
 PUBLIC = {
-    "pipeline/logs/bags.py": {"tell"},  # the method of Python's files
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"promises"},  # a key of plan.toml

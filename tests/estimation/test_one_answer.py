@@ -24,12 +24,12 @@ from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
-from pipeline.report.sections_why import format_remaining
+from pipeline.report.sections import format_remaining
 from pipeline.results import RunDiagnosis, Value, read_result
 from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.simulate import simulate_case
-from pipeline.web.actions import Editor, RunCache, open_session
-from pipeline.web.session import SessionFile
+from pipeline.web.prepared import prepare_run
+from pipeline.web.session import open_session
 from pipeline.words.diagnosis import describe
 from pipeline.words.effects import format_value
 from pipeline.words.objects import diagnosis_as_json
@@ -88,7 +88,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     )
     require_no_rise(told["ladder"])
     if file.model.effects:
-        check_workbench(told, file, own, manifest, SessionFile(tmp_path, manifest.run, "a"))
+        check_workbench(told, file, own, manifest)
         view = view_diagnosis(recording.tables, vehicle, diagnosis.runs[0])
         assert view is not None
         assert set(view.effects) == set(file.model.ids)
@@ -164,16 +164,13 @@ def check_model_verbs(told: Json, file: ModelFile, data: EstimationData) -> Json
     return own
 
 
-def check_workbench(
-    told: Json, file: ModelFile, own: Json, manifest: Manifest, session_file: SessionFile
-) -> None:
+def check_workbench(told: Json, file: ModelFile, own: Json, manifest: Manifest) -> None:
     """*Add all* enters the fit of the diagnosis."""
-    prepared = RunCache().prepared(manifest, str(told["input"]))
-    session = open_session(session_file, prepared)
-    assert all(same(session.step.ladder[0][key], told["ladder"][0][key]) for key in ERRORS)
-    session = Editor(session_file, prepared, session).add_effects(file.model.effects, "+ all", anyway=True)
-    assert all(same(session.step.ladder[-1][key], own[key]) for key in ERRORS)
-    kept = session_file.parse(session.step.model).model
+    session = open_session(prepare_run(manifest, str(told["input"])), None)
+    assert all(same(getattr(session.step.ladder[0], key), told["ladder"][0][key]) for key in ERRORS)
+    session = session.add(file.model.effects, anyway=True)
+    assert all(same(getattr(session.step.ladder[-1], key), own[key]) for key in ERRORS)
+    kept = session.step.model
     for effect in file.model:
         for name, value in effect.values.items():
             assert same(kept.effect(effect.id).values[name], value) or math.isnan(value)

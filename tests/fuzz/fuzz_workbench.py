@@ -26,7 +26,8 @@ from urllib.parse import quote, urlencode
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fixtures"))
 
-from workbench_server import LIMITS, RUN, TOKEN, Workbench
+from workbench_server import LIMITS, RUN, TOKEN
+from workbench_server import ServedWorkbench as Workbench
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -36,7 +37,7 @@ SLOWEST_S = 30.0
 REQUESTS_A_ROUND = 40
 EFFECTS = ("effective_track", "drive_lag", "lateral_skid", "wheel_radius", "own", "magic", "../x", "")
 ACTIONS = (
-    "open", "add", "drop", "switch", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try",
+    "open", "add", "drop", "set", "preview", "lock", "fit", "formula", "undo", "redo", "try",
     "burn",
 )  # fmt: skip
 TEXTS = (
@@ -188,15 +189,11 @@ def intrude(client: Client, rng: random.Random, _: bytes) -> None:
 
 
 def damage(client: Client, rng: random.Random, _: bytes) -> None:
-    """Flip bytes in the state of a session or in a summary, as a stranger's results may hold them."""
+    """Flip bytes in a summary, as a stranger's results may hold them."""
     results = client.server.results
     # The server adds and deletes folders meanwhile: `os.walk` passes over those that are gone.
     names = [Path(folder, name) for folder, _, files in os.walk(results) for name in files]
-    kept = sorted(
-        path
-        for path in names
-        if path.name == "summary.json" or ("workbench" in path.parts and path.suffix == ".json")
-    )
+    kept = sorted(path for path in names if path.name == "summary.json")
     if kept:
         path = rng.choice(kept)
         try:
@@ -260,9 +257,7 @@ def main() -> None:
         results = folder / "results"
         options = Options(out=results, report=True, overrides={"vehicle": {"preset": "husky_a200"}})
         analyze_log(log, options)
-        server = Workbench(
-            results, limits=replace(LIMITS, timeout_s=60.0, memory_bytes=2_000_000_000, silence_s=5.0)
-        )
+        server = Workbench(results, limits=replace(LIMITS, timeout_s=60.0, memory_bytes=2_000_000_000))
         client = Client(
             server,
             (f"{folder}/field", str(results / "workbench" / "uploads"), "site-packages", "pytho" + "n3."),

@@ -9,7 +9,7 @@ from game.rigid_bodies import MACHINES, SkidSteer, simulate_skid_steer
 from numpy.typing import NDArray
 
 from pipeline.simulate.facts import VEHICLES, SimulateError
-from pipeline.simulate.messages import SimulatedRun
+from pipeline.simulate.run import SimulatedRun
 from pipeline.simulate.scenario import Ground, Program, Scenario
 
 pytestmark = pytest.mark.long

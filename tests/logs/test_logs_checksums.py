@@ -15,43 +15,32 @@ from mcap_files import (
     read_damaged,
     read_small,
     record_starts,
+    small_log,
     small_truth,
+    truth_without,
     write_official,
-    write_small,
 )
 
 from pipeline.logs import definition_text
 
 
-def set_crc(content: bytes, start: int, crc: int) -> bytes:
-    damaged = bytearray(content)
-    struct.pack_into("<I", damaged, start + 9 + 24, crc)
-    return bytes(damaged)
-
-
 @pytest.mark.parametrize("change", [0x01, 0xFF0000, 0xFFFFFFFF])
 def test_a_chunk_whose_stored_checksum_is_damaged_is_lost_and_told(tmp_path: Path, change: int) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    content = path.read_bytes()
-    start, _ = chunk_places(content)[3]
-    crc = struct.unpack_from("<I", content, start + 9 + 24)[0]
-    found, losses = read_damaged(path, set_crc(content, start, crc ^ change), truth)
-    first, last = struct.unpack_from("<QQ", content, start + 9)
-    assert found == {key: value for key, value in truth.items() if not first <= key[1] <= last}
-    assert losses == ["chunk_crc"]
+    content, truth = small_log()
+    damaged, place = bytearray(content), chunk_places(content)[3][0] + 9 + 24
+    struct.pack_into("<I", damaged, place, struct.unpack_from("<I", content, place)[0] ^ change)
+    left = truth_without(truth, content, 3)
+    assert read_damaged(tmp_path / "log.mcap", bytes(damaged), truth) == (left, ["chunk_crc"])
 
 
 @pytest.mark.parametrize("compression", ["zstd", ""])
 def test_chunks_that_are_all_damaged_are_not_whole(tmp_path: Path, compression: str) -> None:
     """That every checksum differs is no evidence: here every chunk has the same bit wrong."""
-    path = tmp_path / "log.mcap"
-    truth = write_small(path, compression=compression)
-    content = bytearray(path.read_bytes())
-    chunks = chunk_places(bytes(content))
+    whole, truth = small_log(compression=compression)
+    content, chunks = bytearray(whole), chunk_places(whole)
     for _, end in chunks:
         content[end - 20] ^= 0x10
-    found, losses = read_damaged(path, bytes(content), truth)
+    found, losses = read_damaged(tmp_path / "log.mcap", bytes(content), truth)
     assert not found
     assert losses.count("chunk_crc") + losses.count("damaged_chunk") == len(chunks) >= 9
 
@@ -141,14 +130,10 @@ def test_what_the_file_holds_twice_is_compared(tmp_path: Path, opcode: int, insi
 
 
 def test_what_the_statistics_count_and_nobody_finds_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    write_official(path, enable_crcs=False, use_chunking=False)
-    content = bytearray(path.read_bytes())
-    place = [start for start in record_starts(bytes(content)) if content[start] == 5][7]
-    content[place] = 0x85
-    path.write_bytes(content)
-    data, _ = read_small(path)
-    assert [loss.kind for loss in data.losses] == ["missing_messages"]
+    content, truth = small_log(official=True, enable_crcs=False, use_chunking=False)
+    place = [start for start in record_starts(content) if content[start] == 5][7]
+    damaged = content[:place] + b"\x85" + content[place + 1 :]
+    assert read_damaged(tmp_path / "log.mcap", damaged, truth)[1] == ["missing_messages"]
 
 
 @pytest.mark.parametrize("name", [name for name in damage.LOGS if "no checksum" not in name])

@@ -1,6 +1,8 @@
 """A damaged log gives everything that is whole, nothing that is wrong, and says what is missing."""
 
 import struct
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +12,14 @@ from mcap.writer import CompressionType, IndexType
 from mcap_files import (
     START,
     WITHOUT_INDEX,
-    Truth,
     chunk_places,
     read_damaged,
     read_small,
     record_starts,
     records_of,
+    small_log,
+    truth_without,
     write_official,
-    write_small,
 )
 
 from pipeline.logs import LogError, Wanted, open_log, read_topics
@@ -26,170 +28,161 @@ from pipeline.logs.writer import LogWriter
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
 def test_a_file_cut_anywhere_gives_all_before_the_cut(tmp_path: Path, compression: str) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path, rows=30, compression=compression)
-    content = path.read_bytes()
-    chunks = chunk_places(content)
-    starts = record_starts(content)
-    times = sorted(time for _, time in truth)
-    ends = [(b, struct.unpack_from("<Q", content, a + 17)[0]) for a, b in chunks]
-    for start in starts:
+    content, truth = small_log(rows=30, compression=compression)
+    ends = [(b, struct.unpack_from("<Q", content, a + 17)[0]) for a, b in chunk_places(content)]
+    for start in record_starts(content):
         for cut in (start - 1, start, start + 1):
-            found, losses = read_damaged(path, content[:cut], truth)
+            found, losses = read_damaged(tmp_path / "log.mcap", content[:cut], truth)
             whole = max((last for end, last in ends if end <= cut), default=0)
-            before_cut = sum(time <= whole for time in times)
-            assert len(found) >= before_cut, cut
+            assert len(found) >= sum(time <= whole for _, time in truth), cut
             assert losses, cut
 
 
 def test_a_cut_names_bytes_and_time(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    truth = write_small(path, compression="")
-    content = path.read_bytes()
+    content, truth = small_log(compression="")
     start, end = chunk_places(content)[5]
     path.write_bytes(content[: (start + end) // 2])
     data, found = read_small(path)
     last = max(time for _, time in found)
     (loss,) = [loss for loss in data.losses if loss.kind == "truncated"]
-    assert loss.bytes == (start + end) // 2 - start
-    assert loss.start_ns == last
+    assert (loss.bytes, loss.start_ns) == ((start + end) // 2 - start, last)
     assert all(key in found for key in truth if key[1] <= last)
     assert any(key[1] > struct.unpack_from("<Q", content, start + 9)[0] for key in found)
 
 
-def flip_bytes(path: Path, truth: Truth, content: bytes, places: range, mask: int) -> None:
-    largest = max(int(np.ceil(len(truth) / len(chunk_places(content)))) * 3, 12)
-    inside = np.zeros(len(content), dtype=bool)
-    for start, end in chunk_places(content):
-        inside[start:end] = True
-    for place in places:
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+@pytest.mark.parametrize(
+    ("mask", "step"),
+    [pytest.param(mask, 1, marks=pytest.mark.long) for mask in (0x01, 0xFF)] + [(0xFF, 37)],
+)
+def test_a_flipped_byte_is_never_returned_as_good(
+    tmp_path: Path, compression: str, mask: int, step: int
+) -> None:
+    content, truth = small_log(rows=24, compression=compression)
+    chunks = chunk_places(content)
+    largest = max(-(-len(truth) // len(chunks)) * 3, 12)
+    for place in range(3 % step, len(content), step):
         damaged = bytearray(content)
         damaged[place] ^= mask
-        found, losses = read_damaged(path, bytes(damaged), truth)
-        assert len(found) >= len(truth) - (largest if inside[place] else 0), place
-        if len(found) < len(truth):
-            assert losses, place
-
-
-@pytest.mark.parametrize("compression", ["zstd", ""])
-def test_a_flipped_byte_is_never_returned_as_good(tmp_path: Path, compression: str) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path, rows=24, compression=compression)
-    content = path.read_bytes()
-    flip_bytes(path, truth, content, range(3, len(content), 17), 0xFF)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("mask", [0x01, 0xFF])
-@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
-def test_no_flipped_byte_is_ever_returned_as_good(tmp_path: Path, compression: str, mask: int) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path, rows=24, compression=compression)
-    content = path.read_bytes()
-    flip_bytes(path, truth, content, range(len(content)), mask)
+        found, losses = read_damaged(tmp_path / "log.mcap", bytes(damaged), truth)
+        is_inside = any(start <= place < end for start, end in chunks)
+        assert len(found) >= len(truth) - (largest if is_inside else 0), place
+        assert losses or len(found) == len(truth), place
 
 
 @pytest.mark.parametrize("size", [64, 512])
 def test_zeroed_pages_cost_only_what_stood_there(tmp_path: Path, size: int) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path, compression="")
-    content = path.read_bytes()
+    content, truth = small_log(compression="")
     for start in range(0, len(content), 5 * size):
         damaged = content[:start] + bytes(size) + content[start + size :]
-        found, losses = read_damaged(path, damaged[: len(content)], truth)
-        if start:
-            assert len(found) >= len(truth) - 40, start
-            assert losses or found == truth, start
+        found, losses = read_damaged(tmp_path / "log.mcap", damaged[: len(content)], truth)
+        assert not start or len(found) >= len(truth) - 40, start
+        assert losses or found == truth, start
 
 
 def test_a_zero_padded_tail_is_a_cut(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    content = path.read_bytes()
+    content, truth = small_log()
     for start, end in chunk_places(content)[2:5]:
-        cut = (start + end) // 2
-        found, losses = read_damaged(path, content[:cut] + bytes(4096), truth)
-        whole, _ = read_damaged(path, content[:start], truth)
+        padded = content[: (start + end) // 2] + bytes(4096)
+        found, losses = read_damaged(tmp_path / "log.mcap", padded, truth)
+        whole, _ = read_damaged(tmp_path / "log.mcap", content[:start], truth)
         assert found.keys() >= whole.keys()
         assert "truncated" in losses
 
 
-@pytest.mark.parametrize("lost", [8, 8 + 29, 8 + 29 + 40])
-def test_a_lost_footer_loses_no_message(tmp_path: Path, lost: int) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    found, losses = read_damaged(path, path.read_bytes()[:-lost], truth)
-    assert found == truth
-    assert losses
+SUMMARIES: list[dict[str, Any]] = [
+    {"index_types": IndexType.CHUNK},
+    {"use_summary_offsets": False},
+    {"enable_data_crcs": True},
+    {"compression": CompressionType.LZ4},
+    {"compression": CompressionType.NONE, "chunk_size": 1},
+]
+NO_SUMMARIES: list[dict[str, Any]] = [
+    {"index_types": WITHOUT_INDEX, "use_statistics": False, "use_summary_offsets": False},
+    {"index_types": IndexType.MESSAGE},
+    {"repeat_schemas": False},
+    {"repeat_channels": False},
+    {"use_statistics": False},
+]
 
 
-def test_a_log_without_summary_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_official(path, index_types=WITHOUT_INDEX, use_statistics=False, use_summary_offsets=False)
-    data, found = read_small(path)
-    assert found == truth
-    assert not data.losses
-    assert data.index.message_count == len(truth)
-    assert any("rebuilt" in note for note in data.notes)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"index_types": IndexType.CHUNK},
-        {"index_types": IndexType.MESSAGE},
-        {"repeat_schemas": False},
-        {"repeat_channels": False},
-        {"use_statistics": False},
-        {"use_summary_offsets": False},
-        {"enable_data_crcs": True},
-        {"compression": CompressionType.LZ4},
-        {"compression": CompressionType.NONE, "chunk_size": 1},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [*SUMMARIES, *NO_SUMMARIES], ids=str)
 def test_no_choice_of_the_recorder_loses_anything(tmp_path: Path, options: dict[str, Any]) -> None:
     path = tmp_path / "log.mcap"
     truth = write_official(path, **options)
     data, found = read_small(path)
-    assert found == truth
-    assert not data.losses
-    assert data.index.message_count == len(truth)
+    assert (found, data.losses, data.index.message_count) == (truth, (), len(truth))
+    assert any("rebuilt" in note for note in data.notes) == (options in NO_SUMMARIES)
 
 
-def test_a_wrong_summary_without_checksum_is_found_out(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_official(path, enable_crcs=False)
-    content = bytearray(path.read_bytes())
-    index = next(start for start in record_starts(bytes(content)) if content[start] == 8)
-    for place in (index + 9 + 16, index + 9 + 24):
-        damaged = bytearray(content)
-        damaged[place] ^= 0x10
-        found, losses = read_damaged(path, bytes(damaged), truth)
-        assert found == truth
-        assert losses == ["damaged_summary"]
+def flip(content: bytes, place: int, mask: int = 0xFF) -> bytes:
+    return content[:place] + bytes([content[place] ^ mask]) + content[place + 1 :]
 
 
-def test_messages_whose_channel_is_lost_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    content = bytearray(path.read_bytes()[:-60])
-    start, end = chunk_places(path.read_bytes())[0]
-    summary = next(s for s in record_starts(path.read_bytes()) if path.read_bytes()[s] == 0x0F)
-    content[(start + end) // 2] ^= 0xFF
-    found, losses = read_damaged(path, bytes(content[:summary]), truth)
-    assert not found
-    assert losses.count("unknown_channel") == 3
+def find_record(content: bytes, opcode: int) -> int:
+    return next(start for start in record_starts(content) if content[start] == opcode)
+
+
+def flip_chunk(content: bytes) -> bytes:
+    start, end = chunk_places(content)[0]
+    return flip(content, (start + end) // 2)
+
+
+def stop_chunk(content: bytes) -> bytes:
+    """The second half of a chunk and what comes next were never written."""
+    start, end = chunk_places(content)[4]
+    cut = (start + end) // 2
+    return content[:cut] + bytes(end - cut + 100) + content[end + 100 :]
+
+
+BARE = {"official": True, "enable_crcs": False}
+NONE, EVERY = -1, -2
+DAMAGE: dict[str, tuple[dict[str, Any], Callable[[bytes], bytes], list[str], int]] = {
+    "no last magic": ({}, lambda content: content[:-8], ["damaged_summary"], NONE),
+    "no footer": ({}, lambda content: content[: -8 - 29], ["damaged_summary"], NONE),
+    "a cut summary": ({}, lambda content: content[: -8 - 29 - 40], ["truncated"], NONE),
+    **{
+        f"a wrong summary without checksum, {inside}": (
+            BARE,
+            lambda content, inside=inside: flip(content, find_record(content, 8) + 9 + inside, 0x10),
+            ["damaged_summary"],
+            NONE,
+        )
+        for inside in (16, 24)
+    },
+    "a chunk whose end was never written": ({"compression": ""}, stop_chunk, ["chunk_crc"], 4),
+    "channels lost": (
+        {},
+        lambda content: flip_chunk(content)[: find_record(content, 0x0F)],
+        ["damaged_chunk", *["unknown_channel"] * 3, "damaged_summary"],
+        EVERY,
+    ),
+    "channels that only the cut summary names": (
+        {},
+        lambda content: flip_chunk(content)[:-60],
+        ["truncated", "damaged_chunk"],
+        0,
+    ),
+}
+"""How a log is written, what happens to it, the losses told, and the chunk whose messages are lost."""
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_costs_what_stood_there_and_is_told(tmp_path: Path, name: str) -> None:
+    options, change, told, lost = DAMAGE[name]
+    content, truth = small_log(**options)
+    left = truth if lost == NONE else {} if lost == EVERY else truth_without(truth, content, lost)
+    assert read_damaged(tmp_path / "log.mcap", change(content), truth) == (left, told)
 
 
 def test_a_lost_message_index_loses_nothing(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    content = bytearray(path.read_bytes())
-    for start in record_starts(bytes(content))[:-1]:
+    whole, truth = small_log()
+    content = bytearray(whole)
+    for start, end in pairwise(record_starts(whole)):
         if content[start] == 7:
-            length = int.from_bytes(content[start + 1 : start + 9], "little")
-            content[start + 9 : start + 9 + length] = bytes(length)
+            content[start + 9 : end] = bytes(end - start - 9)
     path.write_bytes(content)
     data, found = read_small(path)
     assert found == truth
@@ -225,22 +218,10 @@ def test_a_damaged_chunk_that_ends_in_zeros_is_not_a_cut_one(tmp_path: Path) -> 
             assert columns.fields["pose.pose.position.x"].tolist() == (rows * 0.25).tolist()
 
 
-def test_a_chunk_whose_end_was_never_written_is_lost_and_told(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path, compression="")
-    content = path.read_bytes()
-    start, end = chunk_places(content)[4]
-    cut = (start + end) // 2
-    found, losses = read_damaged(path, content[:cut] + bytes(end - cut + 100) + content[end + 100 :], truth)
-    assert "chunk_crc" in losses
-    first, last = struct.unpack_from("<QQ", content, start + 9)
-    assert found == {key: value for key, value in truth.items() if not first <= key[1] <= last}
-
-
 def test_without_a_checksum_the_rest_of_a_damaged_chunk_is_lost_and_told(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    truth = write_official(path, enable_crcs=False, compression=CompressionType.NONE)
-    content = bytearray(path.read_bytes())
+    whole, truth = small_log(official=True, enable_crcs=False, compression=CompressionType.NONE)
+    content = bytearray(whole)
     start, end = chunk_places(bytes(content))[4]
     first, last = struct.unpack_from("<QQ", content, start + 9)
     places = [start + 49]
@@ -257,40 +238,23 @@ def test_without_a_checksum_the_rest_of_a_damaged_chunk_is_lost_and_told(tmp_pat
     assert found.items() <= truth.items()
 
 
-def test_where_the_summary_is_cut_its_records_name_what_a_damaged_chunk_named(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    content = bytearray(path.read_bytes()[:-60])
-    start, end = chunk_places(path.read_bytes())[0]
-    content[(start + end) // 2] ^= 0xFF
-    found, losses = read_damaged(path, bytes(content), truth)
-    assert len(found) > len(truth) // 2
-    assert "unknown_channel" not in losses
-
-
 def test_a_damaged_chunk_names_its_time(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    truth = write_small(path, compression="")
-    content = bytearray(path.read_bytes())
-    start, end = chunk_places(bytes(content))[4]
-    content[end - 20] ^= 0x10
-    path.write_bytes(content)
+    content, truth = small_log(compression="")
+    start, end = chunk_places(content)[4]
+    path.write_bytes(flip(content, end - 20, 0x10))
     data, found = read_small(path)
     (loss,) = data.losses
-    first, last = struct.unpack_from("<QQ", content, start + 9)
     assert (loss.kind, loss.chunks, loss.bytes) == ("chunk_crc", 1, end - start)
-    assert (loss.start_ns, loss.end_ns) == (first, last)
-    assert found == {key: value for key, value in truth.items() if not first <= key[1] <= last}
+    assert (loss.start_ns, loss.end_ns) == struct.unpack_from("<QQ", content, start + 9)
+    assert found == truth_without(truth, content, 4)
     assert not data.index.losses
 
 
-@pytest.mark.parametrize("rows", [40])
-def test_damage_in_an_unchunked_log_costs_one_message(tmp_path: Path, rows: int) -> None:
+def test_damage_in_an_unchunked_log_costs_one_message(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    truth = write_official(path, rows=rows, use_chunking=False)
-    content = path.read_bytes()
-    _, found = read_small(path)
-    assert found == truth
+    content, truth = small_log(official=True, rows=40, use_chunking=False)
+    assert read_damaged(path, content, truth) == (truth, [])
     places = [start for start in record_starts(content)[:-1] if content[start] == 5]
     for start in places[5:-5:7]:
         damaged = bytearray(content)
@@ -306,8 +270,7 @@ def test_damage_in_an_unchunked_log_costs_one_message(tmp_path: Path, rows: int)
 
 def test_absurd_lengths_are_refused_before_memory_is_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    content = path.read_bytes()
+    content, truth = small_log()
     start, end = chunk_places(content)[2]
     for place in (start + 1, start + 9 + 16, start + 9 + 28, start + 9 + 32 + 4):
         for size in (1 << 60, (1 << 64) - 1, 1 << 34):
@@ -322,10 +285,8 @@ def test_absurd_lengths_are_refused_before_memory_is_asked_for(tmp_path: Path) -
     assert end > start
 
 
-def test_the_records_counted_here_are_the_official_ones(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    write_small(path)
-    content = path.read_bytes()
+def test_the_records_counted_here_are_the_official_ones() -> None:
+    content, _ = small_log()
     assert len(records_of(content)) == len(record_starts(content)) - 1
 
 

@@ -181,11 +181,9 @@ def test_friction_that_makes_nothing_late_is_a_wider_track() -> None:
         effect = find_effect("contact_friction")(friction=friction, creep=creep, k=1.5, gyration=1.0)
         assert effect.is_degenerate(conditions) == is_track
         simpler = effect.collapse()
-        assert simpler is not None
         assert (simpler.id, simpler.values["k"]) == ("effective_track", 1.5)
     # A search may end at a track that the simpler effect cannot have: that was an error.
     widest = find_effect("contact_friction")(friction=20.0, creep=0.07, k=20.0, gyration=1.0).collapse()
-    assert widest is not None
     assert widest.values["k"] == find_effect("effective_track").parameters[0].bounds[1]
     # Without skid in turns nothing but the creep is seen of a firm ground.
     assert find_effect("contact_friction")(friction=1.4, creep=0.07, k=1.0).is_degenerate(conditions)

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,6 @@ from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
 from pipeline.run import MotionError
-from pipeline.sources import Vehicle
 from pipeline.sources.configuration import RANGES
 
 HARMLESS = "Yard robot 7"
@@ -30,11 +30,6 @@ NAMES = st.one_of(
     st.text(alphabet="-'\"\\\n\r{}<>!#: \x00\u2028aNx", max_size=12),
 )
 VEHICLES = {"differential": HUSKY, "ackermann": CAR}
-
-
-def rename(vehicle: Vehicle, name: str) -> Vehicle:
-    fields = {field: getattr(vehicle, field) for field in vehicle.__struct_fields__}
-    return type(vehicle)(**fields | {"name": name, "id": name})
 
 
 def make_named(kind: str, name: str) -> ModelFile:
@@ -55,9 +50,8 @@ def make_named(kind: str, name: str) -> ModelFile:
         name or "empty": name,
     }
     known = {"wheel_radius.k": (0.96, 0.98), "a---é.k": (0.0, 0.2), "body_speed_limit.limit": (0.8, 1.0)}
-    return make(
-        *effects, wind, vehicle=rename(VEHICLES[kind], name), fit=fit, intervals=known, note=name,
-    )  # fmt: skip
+    vehicle = structs.replace(VEHICLES[kind], name=name, id=name)
+    return make(*effects, wind, vehicle=vehicle, fit=fit, intervals=known, note=name)
 
 
 GAINS = {
@@ -90,29 +84,28 @@ def test_a_number_of_several_grounds_names_each() -> None:
 @settings(max_examples=8)
 @given(name=NAMES)
 def test_a_name_is_data_in_the_files_of_all_targets(target: str, kind: str, name: str) -> None:
-    check_name(target, kind, name)
+    check_names(target, kind, [name])
 
 
 @pytest.mark.parametrize(("target", "kind"), TARGETS)
 def test_names_that_were_made_to_break_out_are_data(target: str, kind: str) -> None:
-    for name in HOSTILE:
-        check_name(target, kind, name)
+    check_names(target, kind, HOSTILE)
 
 
-def check_name(target: str, kind: str, name: str) -> None:
-    shape, names = READERS[target](export_model(make_named(kind, name), target, GAINS))
+def check_names(target: str, kind: str, names: Sequence[str]) -> None:
     plain, known = READERS[target](export_model(make_named(kind, HARMLESS), target, GAINS))
-    assert shape == plain
-    assert [HARMLESS if one == name else one for one in names] == known
     assert HARMLESS in known
+    for name in names:
+        shape, found = READERS[target](export_model(make_named(kind, name), target, GAINS))
+        assert shape == plain
+        assert [HARMLESS if one == name else one for one in found] == known
 
 
-def is_text(name: str) -> bool:
-    """Whether a name is valid Unicode, which all that logs and model files hold is, and not empty."""
-    return bool(name) and not any("\ud800" <= one <= "\udfff" for one in name)
+# What is valid Unicode, which all that logs and model files hold is, and not empty.
+TEXTS = NAMES.filter(lambda name: bool(name) and not any("\ud800" <= one <= "\udfff" for one in name))
 
 
-@given(name=NAMES.filter(is_text))
+@given(name=TEXTS)
 @settings(max_examples=60)
 def test_a_name_comes_back_from_a_model_file(name: str) -> None:
     text = format_model(make_named("differential", name))
@@ -187,12 +180,6 @@ def test_nothing_is_written_of_an_absurd_model(tmp_path: Path) -> None:
         assert not out.exists()
 
 
-def write_own(folder: Path, text: str) -> Path:
-    path = folder / "vesc.yaml"
-    path.write_text(f"speed_to_erpm_gain: 5000.0\n{text}\n", encoding="utf-8")
-    return path
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -206,6 +193,8 @@ def write_own(folder: Path, text: str) -> Path:
     ],
 )
 def test_a_robots_own_file_is_read_whatever_else_stands_in_it(tmp_path: Path, text: str) -> None:
-    found = read_current(write_own(tmp_path, text), "vesc")
+    path = tmp_path / "vesc.yaml"
+    path.write_text(f"speed_to_erpm_gain: 5000.0\n{text}\n", encoding="utf-8")
+    found = read_current(path, "vesc")
     assert found["speed_to_erpm_gain"] == 5000.0
     assert export_model(make(vehicle=CAR), "vesc", GAINS | found)

@@ -1,31 +1,26 @@
-"""What is exported computes what the model computes, and no name in a model becomes code or structure."""
+"""The exported function computes what the model computes, and a model file says again what it was told."""
 
-import builtins
-import json
 import math
 import random
-import symtable
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from exported_files import HUSKY, make, predict
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.estimation import Input
 from pipeline.estimation.run_residuals import RunResiduals
-from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, format_model, list_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
 from pipeline.run import MotionError, MotionRun
 from pipeline.simulate import VEHICLES, Disturbance, Program
 
-HUSKY = vehicle_of("husky_a200")
 HERE = Path("model.toml")
 PRESETS = {"differential": "husky_a200", "ackermann": "ackermann_car", "mecanum": "youbot"}
 YOUBOT = {"vehicle": VEHICLES["youbot"]}
@@ -45,24 +40,6 @@ LEAVES = [
     "(x / (u * s))",
     "-a",
 ]
-NAMES = st.one_of(
-    st.text(max_size=30),
-    st.sampled_from(
-        [
-            '"""',
-            "'''",
-            "\\",
-            "a\nimport os",
-            "{radius}",
-            "{name}",
-            "# no",
-            ": [",
-            "\u2028\x85\x00",
-            "%s",
-            '\\"""\n"""',
-        ]
-    ),
-)
 
 
 def numbers() -> st.SearchStrategy[str]:
@@ -92,25 +69,6 @@ def combine(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
 
 
 FORMULAS = st.recursive(st.one_of(st.sampled_from(LEAVES), numbers()), combine, max_leaves=12)
-
-
-def run_exported(
-    source: str, commands: list[tuple[float, ...]], until_s: float, **more: object
-) -> np.ndarray:
-    space: dict[str, object] = {}
-    exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
-    return np.array(space["predict"](commands, until_s, **more))  # type: ignore[operator]
-
-
-def list_free_names(source: str) -> set[str]:
-    """Names of the module that nothing in it defines."""
-    module = symtable.symtable(source, "exported", "exec")
-    known = {name.get_name() for name in module.get_symbols() if name.is_assigned() or name.is_imported()}
-    known |= {child.get_name() for child in module.get_children()} | set(dir(builtins))
-    used = {
-        name.get_name() for child in module.get_children() for name in child.get_symbols() if name.is_global()
-    }
-    return used - known
 
 
 @settings(max_examples=150)
@@ -146,18 +104,14 @@ def test_an_exported_formula_gives_what_the_model_gives(
         added = float(expression.evaluate({**signals, **effect.values}))
     except MotionError:
         return
-    source = export_model(ModelFile(Model(HUSKY, (effect,))), "python")
-    assert list_free_names(source) == set()
-    rows = run_exported(source, [(-1.0, left, right)], STEP_S, pose=(x, y, yaw), roll=roll, pitch=pitch)
+    rows = predict(make(effect), [(-1.0, left, right)], STEP_S, pose=(x, y, yaw), roll=roll, pitch=pitch)
     expected = added + (signals["v0"] if channel == "v_x" else 0.0)
     assert rows[0, 4 if channel == "v_x" else 5] == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_a_power_of_a_negative_number_keeps_its_sign() -> None:
     effect = FormulaEffect("f", {"v_x": "k**2 * v0"}, (make_parameter("k", "1", (-1.0, 1.0)),), k=-0.5)
-    rows = run_exported(
-        export_model(ModelFile(Model(HUSKY, (effect,))), "python"), [(-1.0, 1.0, 1.0)], STEP_S
-    )
+    rows = predict(make(effect), [(-1.0, 1.0, 1.0)], STEP_S)
     assert rows[0, 4] == pytest.approx(1.25 * HUSKY.wheel_radius_m)
 
 
@@ -168,9 +122,7 @@ def test_an_exported_formula_knows_what_a_wheel_has_turned() -> None:
         FormulaEffect(name, {"v_x": f"k * {text}"}, gain, k=0.01)
         for name, text in zip(("hart-é", "hart_e9"), formulas, strict=True)
     ]
-    source = export_model(ModelFile(Model(HUSKY, tuple(effects))), "python")
-    assert list_free_names(source) == set()
-    rows = run_exported(source, [(-1.0, 2.0, 3.0)], 4.0)
+    rows = predict(make(*effects), [(-1.0, 2.0, 3.0)], 4.0)
     turned = np.arange(1, len(rows) + 1) * STEP_S
     added = 0.02 * np.sin(2.0 * turned) + 0.03 * np.sin(-turned)
     assert rows[:, 4] == pytest.approx(2.5 * HUSKY.wheel_radius_m + added, abs=1e-9)
@@ -213,9 +165,7 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
                 moved += beside(tau=0.2, reset=0.3, drag=0.05, bound=0.3, no_load=1.2, scrub=0.6, creep=0.07)
             moved += effect
             expected = run_residuals.predict_velocity(moved.effects, Timing())
-            fine = run_exported(
-                export_model(ModelFile(moved), "python"), rows, run.duration_s, step_s=STEP_S / 5
-            )
+            fine = predict(ModelFile(moved), rows, run.duration_s, step_s=STEP_S / 5)
             # The model's cells hold means; so do these.
             got = fine[: len(fine) // 5 * 5].reshape(-1, 5, 7).mean(axis=1)
             # Where a command changes within a cell, a limit acts here on both and in the model on their mean.
@@ -229,29 +179,6 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
                 typical = float(np.sqrt(np.mean(wanted**2)))
                 apart = float(np.sqrt(np.mean((seen - wanted) ** 2)))
                 assert apart < 0.02 * max(typical, 0.1), (values, channel, apart, typical)
-
-
-@settings(max_examples=80)
-@given(name=NAMES, note=NAMES, unit=st.sampled_from(["1", "m/m", "rad"]), value=st.floats(-9.0, 9.0))
-def test_no_name_becomes_code_or_structure(name: str, note: str, unit: str, value: float) -> None:
-    vehicle = vehicle_of("husky_a200")
-    vehicle = type(vehicle)(
-        **{f: getattr(vehicle, f) for f in vehicle.__struct_fields__} | {"name": name, "id": "n"}
-    )
-    effect = FormulaEffect("hart-é", {"v_x": "k * v0"}, (make_parameter("k", unit, (-9.0, 9.0)),), k=value)
-    file = ModelFile(
-        Model(vehicle, (effect, find_effect("effective_track")(k=1.5))), note=note, fit={name: [note]}
-    )
-    source = export_model(file, "python")
-    plain = export_model(ModelFile(Model(vehicle_of("husky_a200"), file.model.effects)), "python")
-    assert [line for line in source.splitlines() if not line.startswith("VEHICLE = ")] == [
-        line for line in plain.splitlines() if not line.startswith("VEHICLE = ")
-    ]
-    space: dict[str, object] = {}
-    exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
-    assert space["VEHICLE"] == name
-    assert list(yaml.safe_load(export_model(file, "ros2_control"))) == ["diff_drive_controller"]
-    assert json.loads(export_model(file, "json"))["fit"] == {name: [note]}
 
 
 TREES = st.recursive(

@@ -109,7 +109,6 @@ def test_a_gyro_of_the_wrong_sign_and_a_late_pose_are_found_and_named() -> None:
     run = simulate({"effective_track": 1.7, "clock_offset": 0.12}, imu=Imu(sign=-1, bias_radps=0.01))
     data = EstimationData([run], HUSKY, Input.MEASURED)
     gyro = data.residuals_by_run[0].heading.gyro
-    assert gyro is not None
     assert gyro.signed_scale == pytest.approx(-1.0, abs=0.02)
     assert gyro.bias == pytest.approx(-0.01, abs=0.002)
     assert run.alignment.heading_delay_s == pytest.approx(0.12, abs=0.01)

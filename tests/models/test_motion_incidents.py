@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 from few import few
+from incidents import INCIDENTS, Incident, IncidentKind, simulate_incidents
 from motion_runs import as_run, extract, make_scenario, pass_stages, tables_of, vehicle_of
 
 from pipeline.analysis import Options
@@ -18,10 +19,7 @@ from pipeline.estimation import EstimationData, Input, estimate_intervals, fit_m
 from pipeline.models import Model, find_effect
 from pipeline.run import load_run
 from pipeline.simulate import (
-    INCIDENTS,
     Disturbance,
-    Incident,
-    IncidentKind,
     PoseSensor,
     Program,
     Scenario,
@@ -79,10 +77,9 @@ def draw_cases(count: int, kinds: tuple[IncidentKind, ...] = INCIDENTS, seed: in
             program=Program(programs[int(draw.integers(len(programs)))]),
             pose=PoseSensor(rate_hz=float(draw.choice([20.0, 50.0])), noise_m=noise, noise_rad=0.5 * noise),
             disturbance=Disturbance(0.03, 0.05),
-            incidents=(incident,),
             **({"imu": None} if draw.random() < 0.3 else {}),
         )
-        case = watch(simulate_run(scenario), incident)
+        case = watch(simulate_incidents(scenario, incident), incident)
         if case.end - case.begin >= LONG_ENOUGH_S:
             made += 1
             yield case
@@ -194,8 +191,8 @@ def test_two_long_circles_are_no_incident() -> None:
         assert find(made) == []
 
 
-def fit(scenario: Scenario) -> dict[str, tuple[float, float, float]]:
-    run = as_run(simulate_run(scenario))
+def fit(scenario: Scenario, *incidents: Incident) -> dict[str, tuple[float, float, float]]:
+    run = as_run(simulate_incidents(scenario, *incidents))
     data = EstimationData([run], HUSKY, Input.COMMAND)
     fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in TRUTH)), exact=True)
     items = estimate_intervals(fitted).items
@@ -207,14 +204,14 @@ def fit(scenario: Scenario) -> dict[str, tuple[float, float, float]]:
 def test_an_incident_does_not_move_what_is_fitted(kind: IncidentKind) -> None:
     calm = make_scenario(TRUTH, seed=3, duration_s=200.0)
     without = fit(calm)
-    within = fit(make_scenario(TRUTH, seed=3, duration_s=200.0, incidents=(Incident(kind, 60.0, 80.0),)))
+    within = fit(calm, Incident(kind, 60.0, 80.0))
     for label, (value, _, _) in within.items():
         other, low, high = without[label]
         assert abs(value - other) <= 0.5 * (high - low), label
 
 
 def test_the_fit_goes_on_without_the_seconds_of_an_incident() -> None:
-    made = simulate_run(make_scenario(TRUTH, incidents=(Incident("emergency_stop", 40.0, 60.0),)))
+    made = simulate_incidents(make_scenario(TRUTH), Incident("emergency_stop", 40.0, 60.0))
     run = load_run(tables_of(made, HUSKY), HUSKY, name="stopped")
     middles = EstimationData([run], HUSKY, Input.COMMAND).whole.times.mean(axis=1)
     assert not ((middles > 41.0) & (middles < 60.0)).any()
@@ -223,8 +220,8 @@ def test_the_fit_goes_on_without_the_seconds_of_an_incident() -> None:
 
 
 def test_an_incident_of_a_log_stands_in_its_findings_its_slip_and_its_report(tmp_path: Path) -> None:
-    scenario = make_scenario(TRUTH, duration_s=90.0, incidents=(Incident("manual_driving", 40.0, 52.0),))
-    write_log(simulate_run(scenario), tmp_path / "taken_over.mcap")
+    made = simulate_incidents(make_scenario(TRUTH, duration_s=90.0), Incident("manual_driving", 40.0, 52.0))
+    write_log(made, tmp_path / "taken_over.mcap")
     analyze_log(tmp_path / "taken_over.mcap", Options(out=tmp_path / "out", diagnosis=False))
     (folder,) = {path.parent for path in (tmp_path / "out").rglob("findings.parquet")}
     findings = pl.read_parquet(folder / "findings.parquet")

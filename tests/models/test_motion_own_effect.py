@@ -16,7 +16,7 @@ from pipeline.models.effect import Effect
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.sources import find_preset
-from pipeline.web.session import list_catalogue
+from pipeline.web.cards import list_catalogue
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "pages").rglob("*.md"))
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -69,7 +69,6 @@ def test_a_model_file_never_names_code(place: Path) -> None:
 def test_the_workbench_offers_an_effect_that_was_loaded(place: Path) -> None:
     assert run_verb("model", "new-effect", "side_wind.py").returncode == 0
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     assert "side_wind" not in {one["id"] for one in list_catalogue(vehicle)}
     load_effects([place / "side_wind.py"])
     assert "side_wind" in {one["id"] for one in list_catalogue(vehicle)}

@@ -51,7 +51,6 @@ def delay(times: np.ndarray, ages: np.ndarray) -> np.ndarray:
 def test_repeats_are_left_out_while_wheels_turn_and_kept_at_rest(tables: Mapping[str, pl.DataFrame]) -> None:
     poses, run = tables["poses"].sort("t"), load(tables)
     times, wheels = poses["t"].to_numpy(), run.wheels
-    assert wheels is not None
     turning = np.interp(times, wheels.times, np.maximum(np.abs(wheels.left), np.abs(wheels.right)))
     # Twenty poses in a row, of which the last nineteen repeat the first: once in a turn, once at the start.
     turns = int(np.flatnonzero(np.convolve(turning > 1.0, np.ones(40), "valid") == 40.0)[3]) + 10
@@ -129,7 +128,6 @@ def test_poses_that_grow_older_while_turning_do_not_scale_the_gyro(
     run = load(
         tables, poses=poses.with_columns(pl.Series("t", delay(true, older + draw_ages(true.size, 0.05))))
     )
-    assert run.gyro_fit is not None
     assert run.gyro_fit.signed_scale == pytest.approx(1.0, abs=0.003)
 
 

@@ -3,6 +3,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 import yaml
+from exported_files import predict
 from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.estimation import EstimationData, Input, carry_over, fit_model
@@ -26,15 +27,6 @@ def test_a_model_carries_over_to_the_same_ground_and_warns_on_ice() -> None:
     assert other.ratio > 1.3
     assert "fitted on tile" in other.warning
     assert same.carried.pooled.t_mrmse_m < same.ideal.pooled.t_mrmse_m
-
-
-def run_exported(
-    model: Model, commands: list[tuple[float, ...]], until_s: float, **more: float
-) -> np.ndarray:
-    space: dict[str, object] = {}
-    exec(compile(export_model(ModelFile(model), "python"), "exported", "exec"), space)  # noqa: S102 - that is what it is for
-    rows = space["predict"](commands, until_s, **more)  # type: ignore[operator]
-    return np.array(rows)
 
 
 def typical_model(kind: str) -> Model:
@@ -67,7 +59,7 @@ def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str)
     columns = [series.times, series.left, series.right, series.steering]
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
     # Its steps begin and end ramps a step late: at 800 Hz that is within the tolerance.
-    got = run_exported(model, rows, run.duration_s, step_s=0.00125)
+    got = predict(ModelFile(model), rows, run.duration_s, step_s=0.00125)
     times = run_residuals.grid.times
     for column, channel, size in ((4, "x", 0.02), (5, "y", 0.02), (6, "w", 0.02)):
         seen = np.interp(times, got[:, 0] - 0.000625, got[:, column])

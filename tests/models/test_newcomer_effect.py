@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_motion_export import run_exported
+from exported_files import make, predict
 from verbs import run_verb
 
 import pipeline.models.effects
-from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, catalogue, find_effect
+from pipeline.models import catalogue, find_effect
 from pipeline.sources import find_preset
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +34,7 @@ SidePull = declare(
     confused_with=("lateral_drift",),
 )
 '''
-TESTS = ("effects", "effect_facts", "export")
+TESTS = ("effects", "export")
 PLUGIN = """
 import pipeline.models.effects
 pipeline.models.effects.__path__.append({folder!r})
@@ -68,12 +67,9 @@ def test_a_file_of_an_effect_is_all_that_it_needs(tmp_path: Path) -> None:
     assert "    v_y += k * v0 * abs(v0)\n" in handbook["effects/side_pull.md"]
     assert "[side_pull](side_pull.md)" in handbook["effects/index.md"]
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     effect = find_effect("side_pull")(k=0.2)
     assert effect.describe_motion(vehicle) == "Side pull: k = 0.2 s/m"
-    rows = run_exported(
-        export_model(ModelFile(Model(vehicle, (effect,))), "python"), [(-1.0, 5.0, 5.0)], 0.005
-    )
+    rows = predict(make(effect), [(-1.0, 5.0, 5.0)], 0.005)
     speed = 5.0 * vehicle.wheel_radius_m
     np.testing.assert_allclose(rows[0, 4:6], (speed, 0.2 * speed**2))
     log = tmp_path / "run.mcap"

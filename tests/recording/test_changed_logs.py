@@ -98,7 +98,6 @@ def test_the_line_that_is_offered_settles_it(
     assert line.split("\n")[1] in " ".join(told)
     assert not [one.text for one in settled.findings if one.id in codes]
     for choice in (found, settled):
-        assert choice.recording is not None
         roles = {one.role for one in choice.recording.evidence}
         assert roles >= {"command", "wheels"}
 
@@ -111,7 +110,6 @@ def test_of_two_faults_both_are_corrected(logs: dict[str, tuple[Path, Log, Answe
         assert made is not None
         log = made
     choice = set_up_log(write(log, tmp_path / path.name), Options(out=tmp_path)).choice
-    assert choice.recording is not None
     assert choice.recording.configuration.wheels.reversed == "right"
     assert choice.recording.configuration.pose.heading_deg == pytest.approx(-90.0)
 
@@ -125,7 +123,6 @@ def test_a_unit_that_the_user_gives_is_not_decided_otherwise(
     (tmp_path / "line.toml").write_text('[command]\nyaw_unit = "rad/s"')
     options = Options(out=tmp_path, config=tmp_path / "line.toml")
     choice = set_up_log(write(made, tmp_path / path.name), options).choice
-    assert choice.recording is not None
     assert choice.recording.configuration.command.yaw_unit == "rad/s"
     assert not [one for one in choice.findings if one.severity == "error"]
 
@@ -148,8 +145,6 @@ def load_cases() -> ModuleType | None:
     sys.path.insert(0, str(CASES))
     try:
         spec = importlib.util.spec_from_file_location("field_cases", CASES / "cases.py")
-        assert spec is not None
-        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     finally:
@@ -199,7 +194,6 @@ def test_cases_of_the_field_say_what_they_must(tmp_path: Path) -> None:
     from verbs import run_slip  # noqa: PLC0415
 
     cases = load_cases()
-    assert cases is not None
     wrong = []
     for name, (_, _, must, never, args, config) in cases.CASES.items():
         log = CASES / "logs" / f"{name}.mcap"

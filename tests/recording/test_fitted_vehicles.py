@@ -192,7 +192,6 @@ def test_wheels_whose_radius_commands_and_poses_disagree_on_are_left_out(tmp_pat
     assert choice.sources.command is not None
     said = tell(choice)["wheels_left_out"]
     shown = re.search(r"by the commands the wheel radius is ([\d.]+) m .*, by the poses ([\d.]+) m", said)
-    assert shown is not None
     assert [float(one) for one in shown.groups()] == pytest.approx([RADIUS, 0.3 * RADIUS], rel=0.01)
     assert "30 % of the distance" in said
     assert "--wheel-radius and --track-width, or --vehicle" in said
@@ -229,7 +228,6 @@ def test_the_radius_of_real_vehicles_is_in_its_interval() -> None:
         if chosen is None or not error:
             continue
         truth = find_preset(open_log(log).deployment["vehicle"])
-        assert truth is not None
         inside[log.name] = abs(chosen.vehicle.wheel_radius_m - truth.wheel_radius_m) < 1.96 * error
     assert len(inside) >= 10
     assert sum(not one for one in inside.values()) <= 1, inside

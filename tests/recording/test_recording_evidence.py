@@ -28,7 +28,6 @@ from pipeline.recording.readings import Held, Reading
 def test_gain_and_delay_of_a_command_are_recovered() -> None:
     drive = draw()
     made = command(drive).explain(measured(tabulate(drive)))
-    assert made is not None
     assert made.is_sure
     assert not made.crossed
     assert made.ahead.gains[0] == pytest.approx(1.0, abs=0.01)
@@ -49,7 +48,6 @@ def test_the_sign_of_a_command_is_clear_though_the_vehicle_stands_at_times(turn:
         place=np.concatenate((still + 0j, drive.place)),
     )  # fmt: skip
     made = command(stopped, turn=turn).explain(measured(tabulate(stopped)))
-    assert made is not None
     assert (made.sign("ahead"), made.sign("turned")) == (1, turn)
 
 
@@ -75,7 +73,6 @@ def test_laps_of_one_radius_reverse_no_side_of_the_drive() -> None:
     asked = np.stack([turned, drive.speed / radius], axis=1)
     laps = replace(drive, asked=asked, place=place[drive.rows], yaw=yaw[drive.rows])
     made = command(laps).explain(measured(tabulate(laps)))
-    assert made is not None
     assert not made.crossed
     assert made.sign_margin == np.inf
 
@@ -87,8 +84,6 @@ def test_radius_and_track_come_from_the_motion_and_from_the_controller() -> None
     made = wheels.explain(motion)
     assert made is not None
     radius, track = measure_geometry(made)
-    assert radius is not None
-    assert track is not None
     assert radius.value == pytest.approx(RADIUS, rel=0.01)
     assert track.value == pytest.approx(TRACK / GAIN, rel=0.01)
     driven = explain_wheels(command(drive), wheels)
@@ -121,7 +116,6 @@ def test_a_straight_drive_shows_a_radius_and_no_track() -> None:
     made = sides(straight).explain(measured(tabulate(straight)))
     assert made is not None
     radius, track = measure_geometry(made)
-    assert radius is not None
     assert radius.value == pytest.approx(RADIUS, rel=0.01)
     assert track is None
 
@@ -163,7 +157,6 @@ def test_where_wheels_spin_another_frame_is_told(degrees: float, other: float | 
 def test_a_side_that_counts_backward_is_told_from_all_else(left: float, right: float) -> None:
     drive = draw(5)
     made = sides(drive, left, right).explain(measured(tabulate(drive)))
-    assert made is not None
     assert made.crossed
     assert made.sign_margin > 3.0
     assert (made.ahead.gains[0] > 0.0) == (right < 0.0)
@@ -290,7 +283,6 @@ def test_a_measured_motion_is_no_command() -> None:
     delays = []
     for one in (asked, seen):
         made = one.explain(motion)
-        assert made is not None
         delays.append(made.lag + made.delay)
     # Even where the names say nothing, and the motion comes first by its type.
     asked.name = "/velocity_a"
@@ -315,7 +307,6 @@ def test_a_command_that_is_sent_on_changes_only_says_something_all_the_time() ->
 def test_a_signal_of_another_body_explains_nothing() -> None:
     drive, other = draw(7), draw(8)
     made = command(other).explain(measured(tabulate(drive)))
-    assert made is not None
     assert not made.is_sure
 
 
@@ -390,7 +381,6 @@ def test_wheels_that_roll_straight_on_are_not_exchanged() -> None:
     made = Reading("sides", "/joint_states", Held(at, mean - apart), Held(at, mean + apart)).explain(
         measured(tabulate(line))
     )
-    assert made is not None
     assert made.turned.t[0] < -CLEAR
     assert (made.sign("ahead"), made.sign("turned")) == (1, 0)
 

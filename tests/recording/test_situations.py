@@ -68,7 +68,6 @@ def turned_and_in_degrees(path: Path, drive: Drive) -> Path:
 def with_a_left_encoder_that_counts_double(path: Path, drive: Drive) -> Path:
     """Both edges of the left encoder are counted, and one of the right."""
     read = sides(drive)
-    assert read.first is not None
     first = Held(read.first.times, 2.0 * read.first.values)
     return write_log(path, drive, wheels=replace(read, first=first))
 
@@ -76,7 +75,6 @@ def with_a_left_encoder_that_counts_double(path: Path, drive: Drive) -> Path:
 def exchanged_and_one_counting_double(path: Path, drive: Drive) -> Path:
     """Plugs exchanged, and what is called left has twice the resolution."""
     read = change(sides(drive), lambda speed: speed, exchanged=True)
-    assert read.first is not None
     return write_log(path, drive, wheels=replace(read, first=Held(read.first.times, 2.0 * read.first.values)))
 
 

@@ -420,5 +420,4 @@ def test_topics_of_single_wheels_are_paired_by_short_names(name: str, tmp_path: 
         robot.number(name.format(side), speed) for side, speed in zip(sides, robot.wheels.T, strict=True)
     ]
     setup = set_up(tmp_path, record_twist(robot.asked), *topics, robot.pose())
-    assert setup.sources.wheels is not None
     assert [signal.topic for signal in setup.sources.wheels.signals] == [name.format(side) for side in sides]

@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 from report_synthesis import list_places, make_report
 
-from pipeline.report import ReportError, theme
+from pipeline.report import ReportError
 from pipeline.report.page import write_figures
 from pipeline.report.scene import RunReport
 from pipeline.report.theme import (
@@ -48,17 +48,6 @@ def test_an_unknown_format_and_a_blocked_folder_say_what_to_do(report: RunReport
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ReportError, match="Choose a folder"):
         write_figures(report, tmp_path / "file", "svg")
-
-
-def test_the_ramp_of_slip_is_monotonous_in_lightness() -> None:
-    def luminance(colour: str) -> float:
-        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-        return sum(weight * part**2.2 for weight, part in zip((0.2126, 0.7152, 0.0722), parts, strict=True))
-
-    light = [luminance(colour) for colour in theme.SLIP_RAMP]
-    dark = [luminance(theme.DARK_TWINS[colour]) for colour in theme.SLIP_RAMP]
-    assert light == sorted(light, reverse=True)
-    assert dark == sorted(dark)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Figures of models: what they count, and what a diagnosis becomes."""
+"""Figures of models: what they show of a prediction, and of a step of a command."""
 
 from pathlib import Path
 
@@ -9,7 +9,6 @@ import pytest
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import EstimationData, Input, ModelState, RunResiduals
-from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Model, Timing, find_effect
 from pipeline.report.figures.slip_figures import list_responses
@@ -24,31 +23,6 @@ def vehicle() -> Vehicle:
     found = find_preset("husky_a200")
     assert found is not None
     return found
-
-
-def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> None:
-    rng = np.random.default_rng(7)
-    t = np.arange(2000) * 0.25
-    lags, noise, bound = autocorrelate(t, rng.normal(size=2000))
-    assert lags == pytest.approx(np.arange(11) * 0.5), "windows that overlap are left out"
-    assert bound == pytest.approx(1.96 / np.sqrt(1000.0), rel=1e-4)
-    assert np.mean(np.abs(noise[1:]) < bound) >= 0.8
-    lags, slow, _ = autocorrelate(t, np.sin(t))
-    assert slow[0] == pytest.approx(1.0)
-    assert slow[4] == pytest.approx(np.cos(lags[4]), abs=0.05)
-    split = np.concatenate((t[:1000], t[1000:] + 1e6))
-    assert np.allclose(autocorrelate(split, np.sin(t))[0], lags)
-
-
-def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
-    rng = np.random.default_rng(8)
-    t = np.arange(2000) * 0.25
-    given = np.repeat(rng.normal(size=250), 8)
-    lags, found, bound = cross_correlate(t, given, np.roll(given, 6) + 0.1 * rng.normal(size=2000))
-    assert lags[np.argmax(found)] == pytest.approx(1.5), "the input was there first"
-    assert found.max() > 0.9
-    outside = [np.abs(cross_correlate(t, given, rng.normal(size=2000))[1]) > bound for _ in range(20)]
-    assert np.mean(outside) < 0.1
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -210,8 +210,8 @@ def test_a_missing_or_empty_table_costs_only_its_figures(report: RunReport) -> N
             drawn = {str(found["data-figure"]) for _, found in outline.tags if "data-figure" in found}
             lost: dict[str, set[str]] = {
                 "velocities": {"trajectory", "paths", "stretch"},
-                "slip": {"modulus", "distribution", "command_space", "navigator", "step_response", "stretch"},
-                "windows": {"window_norms"},
+                "slip": {"modulus", "command_space", "step_response", "stretch"},
+                "windows": set(),
                 "aggregates": {"split"},
                 "findings": set(),
             }

@@ -1,4 +1,4 @@
-"""A diagnosis is data: what is stored is read back as it was, also what an earlier version stored."""
+"""A diagnosis is data: what is stored is read back as it was, also with effects that are not loaded."""
 
 import json
 import math
@@ -69,34 +69,29 @@ def test_what_people_get_is_read_back_too() -> None:
     assert format_verdict(read_result(shown, RunDiagnosis)) == format_verdict(DRAWN)
 
 
-def test_a_diagnosis_of_an_earlier_version_is_read_with_what_it_has() -> None:
-    earlier = {
+def test_a_diagnosis_that_names_effects_which_are_not_loaded_is_read_with_what_it_has() -> None:
+    stored = {
         "run": "field/run",
         "verdict": "Over 2 s the ideal model is 1.06 m off.",
         "input": "command",
         "effects": [
             {
                 "id": "gone_effect",
-                "sentence": "It did something that no effect does today.",
+                "sentence": "It did something that no effect here does.",
                 "parameters": {"k": {"value": 1.8, "low": None, "high": None, "unit": "1"}},
                 "gain": None,
                 "growth": None,
             }
         ],
         "unobservable": ["slope_creep"],
-        "unexplained": {"share": 0.3, "channel": "w", "where": "a sentence", "formula": None},
         "ladder": [
             {"effects": [], "t_mrmse_m": 1.06, "r_mrmse_rad": 0.96},
             {"effects": ["gone_effect"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.02, "explained_share": None},
         ],
         "noise_floor": {"t_mrmse_m": 0.05, "r_mrmse_rad": 0.02},
-        "where": [{"channel": "w", "kind": "time", "region": "from 0 to 30 s", "share": 0.9}],
-        "timing": {},
-        "learned": {"kept": False, "reason": "none", "explained_share": {"t_mrmse_m": None}},
-        "lines": [["verdict", "a sentence"]],
         "model": "this is no model file",
     }
-    run = read_result(earlier, RunDiagnosis)
+    run = read_result(stored, RunDiagnosis)
     assert [one.id for one in run.effects] == ["gone_effect"]
     assert measure_excess(run) == pytest.approx(2.0)
     assert read_model(run) is None

@@ -20,45 +20,12 @@ from pipeline.simulate import (
     find_case,
     find_vehicle,
     list_cases,
-    list_effects,
     make_scenario,
     simulate_run,
 )
 from pipeline.simulate.facts import find_layout, open_stream
 from pipeline.simulate.programs import hold_on_grid, lag_signal, limit_rate, make_commands
 from pipeline.simulate.scenario import ProgramName
-
-CATALOGUE_IDS = {
-    *("wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid"),
-    *(
-        "speed_slip",
-        "speed_track",
-        "turning_resistance",
-        "slope_slip",
-        "slope_creep",
-        "side_slope_slip",
-        "side_slope_creep",
-        "side_slope_turn",
-        "lateral_drift",
-        "yaw_drift",
-        "time_drift",
-    ),
-    *("terrain_change", "drive_lag", "turn_lag", "transport_delay", "body_speed_limit", "body_turn_limit"),
-    *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
-    *("yaw_misalignment", "lever_arm", "clock_offset"),
-    *("lateral_scale", "roller_slip", "speed_track"),
-    *("torque_limit", "brake_lag", "reversal_pause", "side_lag", "steering_play", "wheel_servo"),
-    *("drive_gain", "difference_gain", "side_gain", "drive_overshoot", "grade_load"),
-    *("body_acceleration_limit", "turn_acceleration_limit", "wheel_speed_scaling", "contact_friction"),
-    *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
-    *("effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play"),
-    *("motor_imbalance", "load_droop", "tyre_torsion"),
-}
-
-
-def test_every_effect_of_the_catalogue_can_be_asked_for() -> None:
-    assert {effect.id for effect in list_effects()} == CATALOGUE_IDS
-    assert all(item.unit for effect in list_effects() for item in effect.parameters)
 
 
 def test_a_vehicle_has_the_geometry_of_the_preset_that_its_logs_name() -> None:

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from pipeline.simulate.drivetrain import turn_by_motors
 from pipeline.simulate.facts import VEHICLES, Effects
-from pipeline.simulate.messages import simulate_run
 from pipeline.simulate.programs import lag_signal
+from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Program, Scenario
 
 Floats = NDArray[np.float64]

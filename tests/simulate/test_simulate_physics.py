@@ -1,7 +1,7 @@
 """Every effect against numbers worked out by hand from its formula, on motions with a closed form."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.core.rigid import rotate
-from pipeline.simulate.facts import CATALOGUE, VEHICLES
-from pipeline.simulate.messages import simulate_run
+from pipeline.simulate.facts import CATALOGUE, VEHICLES, Vehicle
+from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Commands, Disturbance, Ground, Program, Scenario, State
 
 Floats = NDArray[np.float64]
@@ -19,6 +19,7 @@ Asked = Mapping[str, Mapping[str, float] | float]
 HUSKY = VEHICLES["husky"]
 CAR = VEHICLES["car"]
 YOUBOT = VEHICLES["youbot"]
+OMNI = VEHICLES["omni"]
 BY_KIND = {"differential": HUSKY, "ackermann": CAR, "mecanum": YOUBOT}
 CIRCLE = Scenario(
     program=Program("circle", lead_s=1.0),
@@ -40,135 +41,99 @@ def steady_velocity(effects: Asked, scenario: Scenario = CIRCLE) -> Floats:
 INERTIA = 1.0 + (0.5 * W0) ** 2
 
 
-STEADY: list[tuple[Asked, tuple[float, float, float]]] = [
-    ({}, (V0, 0, W0)),
-    ({"wheel_radius": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
-    ({"wheel_asymmetry": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
-    ({"effective_track": 1.8}, (V0, 0, W0 / 1.8)),
-    ({"icr_offset": 0.12}, (V0, -0.12 * W0, W0)),
-    ({"icr_lateral": 0.1}, (V0 + 0.1 * W0, 0, W0)),
-    ({"lateral_skid": 0.1}, (V0, -0.1 * V0 * W0, W0)),
-    ({"speed_slip": 0.08}, (V0 - 0.08 * V0**2, 0, W0)),
-    ({"turning_resistance": 0.24}, (V0 - 0.24 * V0 * W0, 0, W0)),
-    ({"speed_track": 0.2}, (V0, 0, W0 + 0.2 * V0 * W0)),
-    ({"lateral_drift": 0.05}, (V0, 0.05, W0)),
-    ({"yaw_drift": 0.06}, (V0, 0, W0 + 0.06)),
-    ({"terrain_change": {"k_v": 0.8, "k_w": 0.7, "at_s": 10.0}}, (0.8 * V0, 0, 0.7 * W0)),
-    ({"body_speed_limit": 0.5}, (0.5, 0, W0)),
-    ({"body_turn_limit": 0.4}, (V0, 0, 0.4)),
-    # The right wheel runs at (0.6 + 0.6 * 0.275) / 0.165 = 4.636 rad/s, the left one at 2.636.
-    ({"wheel_speed_limit": 4.0}, ((0.435 + 0.66) / 2, 0, (0.66 - 0.435) / 0.55)),
-    ({"wheel_speed_scaling": 4.0}, (V0 * 0.66 / 0.765, 0, W0 * 0.66 / 0.765)),
-    ({"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
-    ({"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
-    ({"drive_gain": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
-    ({"load_droop": 0.05}, (V0 - 0.05, 0, W0)),
-    ({"difference_gain": 0.5}, (V0, 0, 0.5 * W0)),
-    ({"side_gain": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
-    ({"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),
-    ({"tyre_torsion": {"tau": 0.1, "damping": 0.3}}, (V0, 0, W0)),
-    # The order of a command's way: the track changes w0, and only then inertia and skid look at it.
-    (
-        {"effective_track": 1.5, "lateral_skid": 0.1, "icr_offset": 0.1},
-        (V0, -0.1 * V0 * 0.4 - 0.1 * 0.4, 0.4),
-    ),
-    (
-        {"body_inertia": 0.5, "lateral_skid": 0.1},
-        (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA - 0.1 * V0 * W0, W0),
-    ),
-    ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (V0, 0, W0)),
-]
-
-
-def test_steady_circle_has_the_velocity_of_the_formula() -> None:
-    for effects, expected in STEADY:
-        np.testing.assert_allclose(steady_velocity(effects), expected, atol=1e-6, err_msg=str(effects))
-
-
-def test_ground_effects_may_act_on_what_inertia_made() -> None:
-    after = steady_velocity(
-        {"body_inertia": 0.5, "lateral_skid": 0.1}, replace(CIRCLE, ground_input="inertia")
-    )
-    v_x = V0 / INERTIA
-    np.testing.assert_allclose(after, (v_x, -0.5 * W0 * v_x - 0.1 * v_x * W0, W0), atol=1e-6)
-
-
 # On mecanum wheels a circle is driven at 60 % of 0.8 m/s ahead and to the left, and of 1.2 rad/s.
 AHEAD, ASIDE, AROUND = 0.48, 0.48, 0.72
 LEVER, RADIUS = 0.5 * (0.3 + 0.47), 0.0475
 SLIDING = (AHEAD + 1j * ASIDE) / (1.0 + 0.5j * AROUND)
+DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
 
-
-SIDEWAYS: list[tuple[Asked, tuple[float, float, float]]] = [
-    ({}, (AHEAD, ASIDE, AROUND)),
-    ({"lateral_scale": 0.8}, (AHEAD, 0.8 * ASIDE, AROUND)),
-    ({"roller_slip": 0.3}, (AHEAD, ASIDE - 0.3 * ASIDE**2, AROUND)),
-    ({"lateral_scale": 0.8, "roller_slip": 0.3}, (AHEAD, 0.8 * ASIDE - 0.3 * (0.8 * ASIDE) ** 2, AROUND)),
-    ({"effective_track": 1.2}, (AHEAD, ASIDE, AROUND / 1.2)),
-    ({"wheel_radius": 0.9}, (0.9 * AHEAD, 0.9 * ASIDE, 0.9 * AROUND)),
+STEADY: list[tuple[Vehicle, Asked, tuple[float, float, float]]] = [
+    (HUSKY, {}, (V0, 0, W0)),
+    (HUSKY, {"wheel_radius": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
+    (HUSKY, {"wheel_asymmetry": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
+    (HUSKY, {"effective_track": 1.8}, (V0, 0, W0 / 1.8)),
+    (HUSKY, {"icr_offset": 0.12}, (V0, -0.12 * W0, W0)),
+    (HUSKY, {"icr_lateral": 0.1}, (V0 + 0.1 * W0, 0, W0)),
+    (HUSKY, {"lateral_skid": 0.1}, (V0, -0.1 * V0 * W0, W0)),
+    (HUSKY, {"speed_slip": 0.08}, (V0 - 0.08 * V0**2, 0, W0)),
+    (HUSKY, {"turning_resistance": 0.24}, (V0 - 0.24 * V0 * W0, 0, W0)),
+    (HUSKY, {"speed_track": 0.2}, (V0, 0, W0 + 0.2 * V0 * W0)),
+    (HUSKY, {"lateral_drift": 0.05}, (V0, 0.05, W0)),
+    (HUSKY, {"yaw_drift": 0.06}, (V0, 0, W0 + 0.06)),
+    (HUSKY, {"terrain_change": {"k_v": 0.8, "k_w": 0.7, "at_s": 10.0}}, (0.8 * V0, 0, 0.7 * W0)),
+    (HUSKY, {"body_speed_limit": 0.5}, (0.5, 0, W0)),
+    (HUSKY, {"body_turn_limit": 0.4}, (V0, 0, 0.4)),
+    # The right wheel runs at (0.6 + 0.6 * 0.275) / 0.165 = 4.636 rad/s, the left one at 2.636.
+    (HUSKY, {"wheel_speed_limit": 4.0}, ((0.435 + 0.66) / 2, 0, (0.66 - 0.435) / 0.55)),
+    (HUSKY, {"wheel_speed_scaling": 4.0}, (V0 * 0.66 / 0.765, 0, W0 * 0.66 / 0.765)),
+    (HUSKY, {"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
+    (HUSKY, {"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
+    (HUSKY, {"drive_gain": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
+    (HUSKY, {"load_droop": 0.05}, (V0 - 0.05, 0, W0)),
+    (HUSKY, {"difference_gain": 0.5}, (V0, 0, 0.5 * W0)),
+    (HUSKY, {"side_gain": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
+    (HUSKY, {"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),
+    (HUSKY, {"tyre_torsion": {"tau": 0.1, "damping": 0.3}}, (V0, 0, W0)),
+    # The order of a command's way: the track changes w0, and only then inertia and skid look at it.
     (
-        {"wheel_asymmetry": 0.1},
-        (AHEAD + 0.05 * LEVER * AROUND, ASIDE, AROUND + 0.05 * AHEAD / LEVER),
+        HUSKY,
+        {"effective_track": 1.5, "lateral_skid": 0.1, "icr_offset": 0.1},
+        (V0, -0.1 * V0 * 0.4 - 0.1 * 0.4, 0.4),
     ),
     (
-        {"lateral_skid": 0.1},
-        (AHEAD + 0.1 * ASIDE * AROUND, ASIDE - 0.1 * AHEAD * AROUND, AROUND),
+        HUSKY,
+        {"body_inertia": 0.5, "lateral_skid": 0.1},
+        (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA - 0.1 * V0 * W0, W0),
     ),
-    ({"body_inertia": 0.5}, (SLIDING.real, SLIDING.imag, AROUND)),
-    ({"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (AHEAD, ASIDE, AROUND)),
+    (HUSKY, {"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (V0, 0, W0)),
+    (YOUBOT, {}, (AHEAD, ASIDE, AROUND)),
+    (YOUBOT, {"lateral_scale": 0.8}, (AHEAD, 0.8 * ASIDE, AROUND)),
+    (YOUBOT, {"roller_slip": 0.3}, (AHEAD, ASIDE - 0.3 * ASIDE**2, AROUND)),
+    (
+        YOUBOT,
+        {"lateral_scale": 0.8, "roller_slip": 0.3},
+        (AHEAD, 0.8 * ASIDE - 0.3 * (0.8 * ASIDE) ** 2, AROUND),
+    ),
+    (YOUBOT, {"effective_track": 1.2}, (AHEAD, ASIDE, AROUND / 1.2)),
+    (YOUBOT, {"wheel_radius": 0.9}, (0.9 * AHEAD, 0.9 * ASIDE, 0.9 * AROUND)),
+    (YOUBOT, {"wheel_asymmetry": 0.1}, (AHEAD + 0.05 * LEVER * AROUND, ASIDE, AROUND + 0.05 * AHEAD / LEVER)),
+    (YOUBOT, {"lateral_skid": 0.1}, (AHEAD + 0.1 * ASIDE * AROUND, ASIDE - 0.1 * AHEAD * AROUND, AROUND)),
+    (YOUBOT, {"body_inertia": 0.5}, (SLIDING.real, SLIDING.imag, AROUND)),
+    (YOUBOT, {"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (AHEAD, ASIDE, AROUND)),
     # Rims turn at 0 -+ 0.2772 and 0.96 -+ 0.2772 m/s; only the front right one is held back, to 0.95 m/s.
     (
+        YOUBOT,
         {"wheel_speed_limit": 0.95 / RADIUS},
         (0.4082, 0.4082, (2 * 0.2772 + 0.95 - 0.6828) / 4 / LEVER),
     ),
+    (OMNI, {"lateral_scale": 0.9}, (AHEAD, 0.9 * ASIDE, 0.6 * OMNI.max_turn_radps)),
+    (CAR, {}, (SPEED, 0.0, SPEED * math.tan(DELTA) / 2.6)),
+    (CAR, {"steering_offset": 0.05}, (SPEED, 0.0, SPEED * math.tan(DELTA + 0.05) / 2.6)),
+    (CAR, {"steering_sensor_offset": 0.05}, (SPEED, 0.0, SPEED * math.tan(DELTA + 0.05) / 2.6)),
+    (CAR, {"steering_gain": 0.8}, (SPEED, 0.0, SPEED * math.tan(0.8 * DELTA) / 2.6)),
+    (CAR, {"understeer": 0.03}, (SPEED, 0.0, SPEED * math.tan(DELTA) / (2.6 + 0.03 * SPEED**2))),
+    (CAR, {"effective_wheelbase": 1.2}, (SPEED, 0.0, SPEED * math.tan(DELTA) / (1.2 * 2.6))),
+    (CAR, {"steering_lag": 0.4}, (SPEED, 0.0, SPEED * math.tan(DELTA) / 2.6)),
+    (CAR, {"steering_rate_limit": 0.3}, (SPEED, 0.0, SPEED * math.tan(DELTA) / 2.6)),
+    (CAR, {"steering_sensor_play": 0.05}, (SPEED, 0.0, SPEED * math.tan(DELTA - 0.05) / 2.6)),
+    (CAR, {"body_turn_limit": 0.5}, (SPEED, 0.0, 0.5)),
 ]
 
 
-def test_mecanum_wheels_move_sideways_by_the_formula() -> None:
-    for effects, expected in SIDEWAYS:
-        found = steady_velocity(effects, replace(CIRCLE, vehicle=YOUBOT))
-        np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=str(effects))
-
-
-def test_omni_wheels_turn_about_their_circle() -> None:
-    base = VEHICLES["omni"]
-    found = steady_velocity({"lateral_scale": 0.9}, replace(CIRCLE, vehicle=base))
-    np.testing.assert_allclose(found, (0.48, 0.9 * 0.48, 0.6 * base.max_turn_radps), atol=1e-6)
+def test_a_steady_circle_has_the_velocity_of_the_formula() -> None:
+    for vehicle, effects, expected in STEADY:
+        found = steady_velocity(effects, replace(CIRCLE, vehicle=vehicle))
+        np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=f"{vehicle.name} {effects}")
 
 
 def test_every_mecanum_wheel_has_an_encoder_of_its_own() -> None:
     wheels = simulate_run(replace(CIRCLE, vehicle=YOUBOT)).wheels
-    assert wheels is not None
-    assert wheels.corners is not None
     steady = (wheels.time_s > 20.0) & (wheels.time_s < 28.0)
     found = [float(wheel[steady].mean()) for wheel in wheels.corners.values()]
     turn = LEVER * AROUND
     rims = [AHEAD - ASIDE - turn, AHEAD + ASIDE + turn, AHEAD + ASIDE - turn, AHEAD - ASIDE + turn]
     assert list(wheels.corners) == ["front_left", "front_right", "rear_left", "rear_right"]
     assert found == pytest.approx([rim / RADIUS for rim in rims], abs=0.01)
-
-
-DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
-
-
-STEERED: list[tuple[Asked, float]] = [
-    ({}, SPEED * math.tan(DELTA) / 2.6),
-    ({"steering_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
-    ({"steering_sensor_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
-    ({"steering_gain": 0.8}, SPEED * math.tan(0.8 * DELTA) / 2.6),
-    ({"understeer": 0.03}, SPEED * math.tan(DELTA) / (2.6 + 0.03 * SPEED**2)),
-    ({"effective_wheelbase": 1.2}, SPEED * math.tan(DELTA) / (1.2 * 2.6)),
-    ({"steering_lag": 0.4}, SPEED * math.tan(DELTA) / 2.6),
-    ({"steering_rate_limit": 0.3}, SPEED * math.tan(DELTA) / 2.6),
-    ({"steering_sensor_play": 0.05}, SPEED * math.tan(DELTA - 0.05) / 2.6),
-    ({"body_turn_limit": 0.5}, 0.5),
-]
-
-
-def test_a_car_turns_as_the_bicycle_model_says() -> None:
-    for effects, rate in STEERED:
-        found = steady_velocity(effects, replace(CIRCLE, vehicle=CAR))
-        np.testing.assert_allclose(found, (SPEED, 0.0, rate), atol=1e-6, err_msg=str(effects))
 
 
 def test_a_circle_has_the_radius_of_speed_over_rate() -> None:
@@ -189,21 +154,35 @@ def wheel_response(effects: Asked, scenario: Scenario = STRAIGHT) -> tuple[Float
     return time[keep], drive.left[keep], drive.right[keep]
 
 
-def test_drive_lag_answers_a_step_exponentially() -> None:
-    time, left, _ = wheel_response({"drive_lag": 0.5})
-    np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.5)), atol=2e-5)
+def rise(tau_s: float, to: float = V0 / 0.165) -> Callable[[Floats], Floats]:
+    return lambda time: to * (1.0 - np.exp(-time / tau_s))
 
 
-def test_turn_lag_has_one_time_constant_for_the_mean_and_one_for_the_difference() -> None:
-    time, left, right = wheel_response({"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.2}}, CIRCLE)
-    np.testing.assert_allclose((left + right) / 2, V0 / 0.165 * (1 - np.exp(-time / 0.3)), atol=2e-5)
-    np.testing.assert_allclose(right - left, W0 * 0.55 / 0.165 * (1 - np.exp(-time / 1.2)), atol=2e-5)
+TURNING = rise(1.2, W0 * 0.55 / 0.165)
+RESPONSES: list[tuple[Asked, Scenario, Callable[[Floats], Floats], Callable[[Floats], Floats], float]] = [
+    ({"drive_lag": 0.5}, STRAIGHT, rise(0.5), rise(0.5), 2e-5),
+    (
+        {"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.2}},
+        CIRCLE,
+        lambda time: rise(0.3)(time) - 0.5 * TURNING(time),
+        lambda time: rise(0.3)(time) + 0.5 * TURNING(time),
+        2e-5,
+    ),
+    ({"side_lag": {"tau_left": 0.9, "tau_right": 0.5}}, STRAIGHT, rise(0.9), rise(0.5), 2e-5),
+    (
+        {"acceleration_limit": 2.0},
+        STRAIGHT,
+        *[lambda time: np.minimum(2.0 * time, V0 / 0.165)] * 2,
+        2e-3,
+    ),
+]
 
 
-def test_each_side_has_a_lag_of_its_own() -> None:
-    time, left, right = wheel_response({"side_lag": {"tau_left": 0.9, "tau_right": 0.5}})
-    np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.9)), atol=2e-5)
-    np.testing.assert_allclose(right, V0 / 0.165 * (1 - np.exp(-time / 0.5)), atol=2e-5)
+def test_a_step_of_the_command_is_answered_as_the_formula_says() -> None:
+    for effects, scenario, on_left, on_right, atol in RESPONSES:
+        time, left, right = wheel_response(effects, scenario)
+        np.testing.assert_allclose(left, on_left(time), atol=atol, err_msg=str(effects))
+        np.testing.assert_allclose(right, on_right(time), atol=atol, err_msg=str(effects))
 
 
 # Forward for four seconds, backward for four, both from a command at a round second.
@@ -289,11 +268,6 @@ def test_tyres_stay_within_the_play_of_their_steering() -> None:
     assert np.abs(plain - loose).max() <= 0.04 + 1e-12
     # It follows from behind: after each peak it stays until the steering has come back through the play.
     assert loose.max() == pytest.approx(plain.max() - 0.04)
-
-
-def test_acceleration_limit_makes_a_ramp() -> None:
-    time, left, _ = wheel_response({"acceleration_limit": 2.0})
-    np.testing.assert_allclose(left, np.minimum(2.0 * time, V0 / 0.165), atol=2e-3)
 
 
 @pytest.mark.parametrize("delay", [0.2, 0.1234567])

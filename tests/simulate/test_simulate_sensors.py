@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.rigid import euler_from_quaternions, interpolate_poses, rotate, wrap_angle
 from pipeline.simulate.facts import SimulateError
-from pipeline.simulate.messages import SimulatedRun, integrate_odometry, simulate_run
+from pipeline.simulate.run import SimulatedRun, integrate_odometry, simulate_run
 from pipeline.simulate.scenario import Ground, Imu, PoseSensor, Program, Scenario
 
 Floats = NDArray[np.float64]

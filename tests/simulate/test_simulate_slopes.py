@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.core.rigid import euler_from_quaternions
 from pipeline.simulate import SLOPE_EFFECTS
-from pipeline.simulate.messages import simulate_run
+from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Ground, Program, Scenario
 
 

@@ -72,7 +72,6 @@ def test_units_are_converted() -> None:
 
 def test_a_platform_knows_its_own_units() -> None:
     car = find_preset("f1tenth")
-    assert car is not None
     scale, offset, made = convert_unit("servo", car.units, where="/commands/servo/position")
     assert scale * (0.5304 - 1.2135 * 0.2 - offset) == pytest.approx(0.2)
     assert made == "rad"

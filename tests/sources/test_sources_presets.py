@@ -29,7 +29,6 @@ def test_published_vehicles_have_their_published_numbers() -> None:
         ("marmotte_hd2", 0.116, 0.5927, None),
     ]:
         vehicle = find_preset(name)
-        assert vehicle is not None
         assert (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.mass_kg) == (radius, track, mass)
 
 

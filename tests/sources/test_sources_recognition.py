@@ -40,7 +40,6 @@ def recognize(
 @pytest.mark.parametrize("shape", [CYLINDER, MESH], ids=["a cylinder", "a mesh, over the footprint"])
 def test_wheels_of_a_description_give_radius_and_track(shape: str) -> None:
     found = read_description(BURGER.format(shape=shape))
-    assert found is not None
     assert (found.name, found.kind) == ("turtlebot3_burger", "differential")
     assert found.wheel_radius_m == pytest.approx(0.033, abs=1e-3)
     assert found.track_width_m == pytest.approx(0.16, abs=1e-3)
@@ -51,7 +50,6 @@ def test_a_car_is_told_by_its_steering_joints() -> None:
     platform = PLATFORMS["ackermann_steering_controller"]
     (text,) = [one.fields["data"] for one in platform.topics if one.topic == "/robot_description"]
     found = read_description(str(text))
-    assert found is not None
     assert found.kind == "ackermann"
     assert found.wheelbase_m == pytest.approx(platform.vehicle.wheelbase_m)
     assert found.track_width_m == pytest.approx(platform.vehicle.track_width_m)
@@ -68,10 +66,8 @@ def test_a_car_turns_its_wheels_as_far_as_its_description_says(limit: str, large
     (text,) = [one.fields["data"] for one in platform.topics if one.topic == "/robot_description"]
     joint = f"<limit {limit} effort='10' velocity='2'/></joint>"
     found = read_description(str(text).replace("</joint>", joint))
-    assert found is not None
     assert found.max_steering_rad == largest
     recognized = recognize_vehicle([], {}, found)
-    assert recognized is not None
     assert recognized.vehicle.max_steering_rad == largest
 
 
@@ -100,7 +96,6 @@ def test_a_namespace_tells_the_platform() -> None:
         ("/rosbot_xl/cmd_vel", "rosbot_xl"),
     ]:
         found = recognize(topic)
-        assert found is not None
         assert (found.vehicle.id, found.source) == (vehicle, "namespace")
 
 
@@ -109,18 +104,14 @@ def test_mecanum_wheels_are_told_by_a_description_that_speaks_of_them() -> None:
     plain = read_description(str(text).replace("youbot", "my_robot"))
     rollers = str(text).replace("youbot", "my_robot").replace("<link ", '<link name="roller_1"/><link ', 1)
     described = read_description(rollers)
-    assert plain is not None
-    assert described is not None
     assert (plain.kind, described.kind) == ("differential", "mecanum")
     found = recognize_vehicle([], {}, described)
-    assert found is not None
     assert (found.vehicle.kind, found.vehicle.wheelbase_m) == ("mecanum", pytest.approx(0.47))
 
 
 def test_a_description_of_no_platform_gives_its_own_geometry() -> None:
     described = read_description(BURGER.format(shape=CYLINDER).replace("turtlebot3_burger", "my_robot"))
     found = recognize_vehicle([], {}, described)
-    assert found is not None
     assert (found.vehicle.id, found.source) == ("my_robot", "robot_description")
     assert found.vehicle.track_width_m == pytest.approx(0.16, abs=1e-3)
 
@@ -128,7 +119,6 @@ def test_a_description_of_no_platform_gives_its_own_geometry() -> None:
 def test_where_description_and_preset_differ_both_are_said() -> None:
     wide = BURGER.format(shape=CYLINDER).replace("0.0 0.08 0.023", "0.0 0.18 0.023")
     found = recognize_vehicle([], {}, read_description(wide))
-    assert found is not None
     assert found.vehicle.id == "turtlebot3_burger"
     (note,) = found.notes
     assert "0.26" in note
@@ -150,7 +140,6 @@ def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None
     assert car is not None
     (text,) = [one.fields["data"] for one in PLATFORMS["youbot"].topics if "description" in one.topic]
     described = recognize_vehicle([], {}, read_description(str(text).replace("youbot", "my_robot")))
-    assert described is not None
     assert described.vehicle.kind == "differential"
     assert list_contradictions(described.vehicle, youbot) == []
     assert "kind differential, not ackermann" in list_contradictions(described.vehicle, car)

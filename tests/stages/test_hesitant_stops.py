@@ -15,7 +15,6 @@ STEP_S = 0.05
 def find(command: Floats, is_stopped: Flags, times: Floats | None = None) -> list[tuple[str, float, float]]:
     """Incidents of a vehicle that follows its commands, but for some time."""
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     times = np.arange(command.size) * STEP_S if times is None else times
     follows = np.where(is_stopped, 0.0, command)
     flags = np.zeros(command.size, dtype=bool)
@@ -62,7 +61,6 @@ def test_segments_that_overlap_where_the_poses_jump_hide_no_stop() -> None:
 def test_a_side_that_stands_while_the_other_one_follows_is_told_and_left_out(side: float) -> None:
     """A stuck wheel made all turning of the run an unknown effect."""
     vehicle, rng = find_preset("husky_a200"), np.random.default_rng(3)
-    assert vehicle is not None
     times, half = np.arange(0.0, 120.0, STEP_S), 0.5 * vehicle.track_width_m
     number = (times // 2.5).astype(int)
     asked = np.column_stack(

@@ -155,7 +155,6 @@ def test_models_get_no_command_before_the_drive_followed_it(vehicle: Vehicle) ->
     marked, _ = mark_late_starts(commands, wheels, vehicle)
     tables = {"commands": marked, "wheels": wheels, "poses": make_poses(commands["t"])}
     run = make_run(tables, vehicle, Alignment(), name="run")
-    assert run.commands is not None
     late = starts[3]
     between = (run.commands.times >= late) & (run.commands.times < late + 0.7)
     assert not between.any()
@@ -171,5 +170,4 @@ def test_a_short_gap_and_a_late_start_put_no_stop_into_the_commands(vehicle: Veh
     assert findings
     tables = {"commands": marked, "wheels": wheels, "poses": make_poses(commands["t"])}
     run = make_run(tables, vehicle, Alignment(hold_s=0.5), name="run")
-    assert run.commands is not None
     assert np.count_nonzero(run.commands.left[:-1] == 0.0) == 0

@@ -6,19 +6,12 @@ import numpy as np
 import polars as pl
 import pytest
 from few import few
+from incidents import TRACTION, Incident, IncidentKind, simulate_incidents
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.run.signals import Limits, trace_traction
-from pipeline.simulate import (
-    TRACTION,
-    VEHICLES,
-    Incident,
-    IncidentKind,
-    Scenario,
-    simulate_run,
-    write_log,
-)
+from pipeline.simulate import VEHICLES, Scenario, write_log
 from pipeline.simulate.scenario import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.inputs import Ideal
@@ -93,7 +86,6 @@ def test_a_body_that_slides_sideways_does_not_dig_in(
     forward: float, sideways: float, said: list[str]
 ) -> None:
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     times = np.arange(0.0, 60.0, STEP_S)
     # Over two seconds the motion turns from ahead to the side, or is lost.
     part = np.clip((times - 40.0) / 2.0, 0.0, 1.0) * (times < 46.0)
@@ -110,7 +102,6 @@ def test_a_body_that_slides_sideways_does_not_dig_in(
 
 def test_a_sensor_ahead_of_the_axles_is_not_seen_to_slide_in_turns() -> None:
     vehicle = find_preset("husky_a200")
-    assert vehicle is not None
     times = np.arange(0.0, 60.0, STEP_S)
     turns = np.where((times > 30.0) & (times < 40.0), 1.0, 0.0)
     columns = {"t": times, "v_x": 1.0 - turns, "v_y": turns, "v_w": turns, "x": times, "y": times}
@@ -124,9 +115,9 @@ def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Pat
     at = np.arange(0.0, 89.0, 0.1)
     ahead = Commands(at, np.where(at % 30.0 < 27.0, 0.6, 0.0), 0.3 * (at % 30.0 < 8.0))
     incidents = tuple(Incident(kind, *one) for one in times)
-    scenario = Scenario(VEHICLES["husky"], played=ahead, duration_s=90.0, seed=4, incidents=incidents)
+    scenario = Scenario(VEHICLES["husky"], played=ahead, duration_s=90.0, seed=4)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_log(simulate_run(scenario), path)
+    write_log(simulate_incidents(scenario, *incidents), path)
     return path
 
 

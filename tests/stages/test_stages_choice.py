@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from clocks import SimulatedClock
 from simulated_platforms import scene_of
 from stage_logs import FIELD, PLAIN, TakeThrough
 
@@ -13,7 +14,7 @@ from pipeline.core import rigid
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
 from pipeline.recording.log_choice import Choice, choose
-from pipeline.simulate import Clock, PoseSensor, Recording, Scenario, make_scenario, simulate_run, write_log
+from pipeline.simulate import PoseSensor, Recording, Scenario, make_scenario, simulate_run, write_log
 from pipeline.sources import (
     Configuration,
     DriveSection,
@@ -87,7 +88,6 @@ def test_beside_a_pose_of_the_wheels_alone_the_drive_is_observed_and_no_ground(t
     told = {finding.id: finding.text for finding in chosen.findings}
     assert told.keys() == {"ground_unobservable", "numbers_not_used"}
     assert "wheel odometry, not a localization" in told["numbers_not_used"]
-    assert chosen.sources.pose is not None
     assert chosen.sources.pose.wheels is not None
 
 
@@ -210,7 +210,7 @@ def test_simulated_time_carries_topics_without_stamps_along(factor: float) -> No
 
 def test_a_simulated_log_keeps_its_effects(tmp_path: Path) -> None:
     scenario = scene_of("nav2", {}, seed=3, duration_s=40.0)
-    chosen = look(record(replace(scenario, clock=Clock(real_time_factor=0.3)), tmp_path))
+    chosen = look(record(replace(scenario, clock=SimulatedClock(factor=0.3)), tmp_path))
     assert str(chosen.sources.pose) == "/tf"
     assert chosen.ratings[0].coverage == pytest.approx(1.0, abs=0.05)
 
@@ -275,7 +275,6 @@ def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
 )
 def test_velocities_in_another_unit_than_their_positions_are_converted(unit: str | None, gain: float) -> None:
     husky = find_preset("husky_a200")
-    assert husky is not None
     count = 400
     times = np.arange(count) / 20.0
     speed = 3.0 + np.sin(times)

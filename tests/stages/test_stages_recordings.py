@@ -6,6 +6,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 from few import few
+from store_samples import read_current
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -85,9 +86,8 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, rec
     assert isinstance(measured, dict)
     assert isinstance(command, dict)
     # The independent chain puts nothing right. Other sensible smoothing moves these numbers by some 10 %.
-    medians = (
-        Store(recorded_results).read(str(summary["run"]), "aggregates").filter(pl.col("subset") == "all")
-    )
+    store, run = Store(recorded_results), str(summary["run"])
+    medians = read_current(store, run, "aggregates").filter(pl.col("subset") == "all")
     recorded = dict(medians.select("input", "median_recorded_modulus").iter_rows())
     assert recorded["measured"] == pytest.approx(known.measured, rel=0.15)
     assert recorded["command"] == pytest.approx(known.command, rel=0.15)
@@ -96,7 +96,7 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, rec
     assert measured["median_window_norm"] <= 1.15 * known.norm
     if "command_scale" not in known.faults:
         assert command["median_modulus"] <= 1.02 * recorded["command"]
-    compared = Store(recorded_results).read(str(summary["run"]), "slip").filter(pl.col("input") == "command")
+    compared = read_current(store, run, "slip").filter(pl.col("input") == "command")
     assert summary["duration_s"] == pytest.approx(0.05 * compared.filter(~pl.col("suspect")).height, abs=0.06)
     assert (summary["distance_m"] is None) == ("not_moving" in known.faults)
     assert summary["held_poses"] == pytest.approx(known.held, abs=0.015)

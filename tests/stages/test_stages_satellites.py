@@ -10,9 +10,9 @@ from simulated_platforms import fix, ground_velocity, to_earth
 from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
-from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
+from pipeline.simulate import Imu, Layout, PoseSensor, Scenario
 from pipeline.simulate.facts import Published
-from pipeline.simulate.topics import imu, joints, twist
+from pipeline.simulate.messages import imu, joints, twist
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver
 from pipeline.stages.satellite import (
@@ -49,7 +49,7 @@ ANTENNA = Published(
 def publishing(scenario: Scenario, *topics: Published) -> Scenario:
     """A scenario that publishes a twist, joint states and some topics."""
     drive = (twist("/cmd_vel", stamped=True), joints("/joint_states", "{}_wheel_joint", FOUR))
-    layout = Layout("differential", (), (), PoseTopic("odometry", ""), topics=(*drive, *topics))
+    layout = Layout("differential", (*drive, *topics))
     return replace(scenario, recording=replace(scenario.recording, layout=layout))
 
 

@@ -1,10 +1,12 @@
 """Traps of time: clocks, latencies, the gyro as the better clock."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import polars as pl
 import pytest
+from clocks import BunchedClock, SimulatedClock, forget_stamps, lose_between
 from few import few
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -187,16 +189,16 @@ def unstamped() -> Scenario:
 @pytest.mark.parametrize(
     ("clock", "noticed"),
     [
-        (Clock(real_time_factor=1.0), "clock_offset"),
-        (Clock(real_time_factor=0.6, swing=0.5), "simulated_time"),
-        (Clock(real_time_factor=0.6, bunch_s=0.2), "bunched_times"),
+        (SimulatedClock(), "clock_offset"),
+        (SimulatedClock(factor=0.6, swing=0.5), "simulated_time"),
+        (SimulatedClock(factor=0.6, bunch_s=0.2), "bunched_times"),
         *(
             pytest.param(clock, noticed, marks=pytest.mark.long)
             for clock, noticed in (
-                (Clock(real_time_factor=1.0, swing=0.5), "simulated_time"),
-                (Clock(real_time_factor=0.6), "simulated_time"),
-                (Clock(real_time_factor=0.05), "simulated_time"),
-                (Clock(bunch_s=0.2), "bunched_times"),
+                (SimulatedClock(swing=0.5), "simulated_time"),
+                (SimulatedClock(factor=0.6), "simulated_time"),
+                (SimulatedClock(factor=0.05), "simulated_time"),
+                (BunchedClock(), "bunched_times"),
             )
         ),
     ],
@@ -208,7 +210,7 @@ def test_trap_5_slip_is_that_of_a_log_with_one_clock(
     plain, taken = drive(unstamped), drive(replace(unstamped, clock=clock))
     assert noticed in taken.ids()
     assert noticed not in plain.ids()
-    if clock.real_time_factor not in (None, 1.0):
+    if getattr(clock, "factor", 1.0) != 1.0:
         # The default screen shows warnings: on a robot, all speeds are wrong by this factor.
         assert "simulated_time" in taken.warned()
     for name in ("command", "measured"):
@@ -217,8 +219,8 @@ def test_trap_5_slip_is_that_of_a_log_with_one_clock(
 
 
 def test_trap_5_topics_whose_stamps_are_zero_have_log_times(drive: TakeThrough, unstamped: Scenario) -> None:
-    zero = replace(unstamped.recording, zero_stamps=("/joint_states", "/imu/data"))
-    for clock in (Clock(), Clock(real_time_factor=0.6)):
+    zero = replace(unstamped.recording, lose=partial(forget_stamps, ("/joint_states", "/imu/data")))
+    for clock in (Clock(), SimulatedClock(factor=0.6)):
         taken = drive(replace(unstamped, recording=zero, clock=clock))
         plain = drive(unstamped)
         assert "no_header_stamp" in taken.ids()
@@ -238,8 +240,8 @@ def test_trap_5_a_recorder_whose_clock_goes_back_mixes_nothing(drive: TakeThroug
 
 
 def test_trap_5_a_hole_in_everything_is_crossed_by_nothing(drive: TakeThrough) -> None:
-    taken = drive(replace(FIELD, recording=Recording(gaps=2, gap_s=3.0)))
-    assert taken.velocities["segment"].n_unique() == 3
+    taken = drive(replace(FIELD, recording=Recording(lose=partial(lose_between, 25.0, 28.0))))
+    assert taken.velocities["segment"].n_unique() == 2
     for windows in (taken.windows("command"), taken.windows("measured")):
         spans = windows["t_end"] - windows["t_start"]
         assert spans.max() == pytest.approx(2.0)
@@ -256,7 +258,6 @@ def test_trap_6_the_sign_of_the_gyro_is_checked_and_corrected(drive: TakeThrough
 def test_trap_6_scale_and_bias_of_the_gyro_are_found_and_taken_off(drive: TakeThrough) -> None:
     taken = drive(replace(FIELD, imu=Imu(scale=0.8, bias_radps=0.05)))
     assert taken.finding("imu_scale").value == pytest.approx(1.25, rel=0.01)
-    assert taken.aligned.alignment.gyro is not None
     # Poses = scale x gyro + bias: an offset of 0.05 in the gyro is one of -0.0625 in the poses.
     assert taken.aligned.alignment.gyro.bias == pytest.approx(-0.0625, abs=2e-3)
     assert rms(taken.velocities["v_w_imu"] - taken.velocities["v_w"]) < 0.03
@@ -269,7 +270,6 @@ def test_trap_6_the_gyro_fits_alike_whenever_the_recorder_was_started(drive: Tak
     for late in (0.0, 12.8, 0.7):
         shifted = {name: frame.with_columns(pl.col("t") + late) for name, frame in tables.items()}
         made = align_tables(shifted, taken.aligned.vehicle, Alignment(), body_commanded=True, where="shifted")
-        assert made.alignment.gyro is not None
         fits.append((made.alignment.gyro.signed_scale, made.alignment.gyro.bias))
     assert fits[1:] == [pytest.approx(fits[0], rel=1e-9)] * 2
 
@@ -322,8 +322,6 @@ def test_a_delay_comes_back_with_its_sign(late: float, seed: int) -> None:
         return np.sum(np.sin(speeds[:, None] * at + phases[:, None]), axis=0)
 
     found = estimate_delay(times, signal(times - late), times, signal(times))
-    assert found is not None
     assert found.seconds == pytest.approx(late, abs=0.01)
     mirrored = estimate_delay(times, -signal(times - late), times, signal(times))
-    assert mirrored is not None
     assert mirrored.correlation < -0.95

@@ -1,7 +1,6 @@
 """Twist of a car whose angular.z is a steering angle, as some drivers of Ackermann vehicles take it."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +16,19 @@ from pipeline.simulate import (
     LAYOUTS,
     VEHICLES,
     Disturbance,
+    Layout,
     Program,
     Recording,
     Scenario,
     simulate_run,
     write_log,
 )
-from pipeline.simulate.facts import DriveTopic
+from pipeline.simulate.messages import twist
 from pipeline.simulate.scenario import Commands
 from pipeline.sources import find_preset
 from pipeline.store import Manifest
 
-_LAYOUT = replace(LAYOUTS["ackermann"], commands=(DriveTopic("twist_stamped", ("/cmd_vel",)),), wheels=())
+_LAYOUT = Layout("ackermann", (twist("/cmd_vel", stamped=True), *LAYOUTS["ackermann"].topics[2:]))
 _TOLD = "holds steering angles in place of yaw rates"
 
 
@@ -102,7 +102,6 @@ def test_yaw_rates_beyond_the_largest_steering_are_no_angles(
 ) -> None:
     """A turn at full lock is proportional to the speed, too, where the stick asks for a tighter one."""
     car, draw = find_preset("ackermann_car"), np.random.default_rng(5)
-    assert car is not None
     times = np.arange(0.0, 240.0, STEP)
     speed = np.repeat(draw.uniform(0.5, 5.0, 60), 400)
     asked = np.repeat(draw.uniform(-0.8, 0.8, 60), 400) * (0.4 if holds_angles else 1.0)

@@ -1,18 +1,24 @@
-"""What is in the Parquet files: the same frame, units and frames, the same bytes; broken rows kept apart."""
+"""Tables: what is in their files, and asked over all runs, lazily and in SQL, in bounded memory."""
 
 import datetime as dt
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 
 import dataframely as dy
+import numpy as np
 import polars as pl
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from store_samples import break_windows, make_slip, make_windows
+from polars.testing import assert_frame_equal
+from store_samples import make_slip, make_windows, write_generation
 
-from pipeline.store import Store, StoreError
+from pipeline.store import Manifest, Store, StoreError, check_size
+from pipeline.store.manifests import encode_manifest
 from pipeline.store.parquet_tables import check_table, encode_parquet, schema_of
 from schemas import Contract, Table, list_contracts
 
@@ -117,34 +123,6 @@ def test_same_frame_gives_same_bytes_in_another_process() -> None:
     assert len(hashes) == 1
 
 
-def test_broken_rows_go_to_the_quarantine_with_the_names_of_the_rules(store: Store) -> None:
-    frame = break_windows(make_windows("r", 1, rows=6))
-    with store.open_generation("r", "k") as generation:
-        report = generation.write_table("windows", frame)
-        manifest = generation.commit({})
-    assert (report.rows, report.quarantined) == (4, 2)
-    assert set(report.rules) == {"terrain|nullability", "segment|min", "t_end|check"} | {
-        rule for rule in report.rules if rule.startswith("t_end|")
-    }
-    assert store.read("r", "windows").equals(frame.filter(pl.int_range(pl.len()).is_in([0, 2, 4, 5])))
-
-    entry = manifest.tables["windows"]
-    assert (entry.rows, entry.quarantined, entry.rules) == (4, 2, report.rules)
-    broken = store.read("r", "quarantine_windows")
-    assert broken.drop("broken_rules").equals(frame.filter(pl.int_range(pl.len()).is_in([1, 3])))
-    assert broken["broken_rules"].to_list()[0] == ["terrain|nullability"]
-    assert {"segment|min", "t_end|check"} <= set(broken["broken_rules"].to_list()[1])
-    assert pq.read_schema(manifest.path("quarantine_windows")).field("t_end").metadata[b"unit"] == b"s"
-
-
-def test_rows_that_are_all_broken_leave_an_empty_table(store: Store) -> None:
-    frame = make_windows("r", 1, rows=4).with_columns(samples=pl.lit(0, pl.Int32))
-    with store.open_generation("r", "k") as generation:
-        assert generation.write_table("windows", frame).rules == {"samples|min": 4}
-        generation.commit({})
-    assert store.read("r", "windows").equals(frame.clear())
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -165,6 +143,206 @@ def test_wrong_columns_are_named(store: Store, change: object, complaint: str) -
     assert caught.value.code == "wrong_columns"
 
 
-def test_unknown_table_names_those_there_are() -> None:
-    with pytest.raises(StoreError, match="velocities"):
-        schema_of("velocity")
+def rewrite(manifest: Manifest) -> None:
+    """Write the manifest of a run as somebody would who knows how it is made."""
+    (manifest.home / "manifest.json").write_bytes(encode_manifest(manifest))
+
+
+def test_no_runs_give_the_columns_of_the_contract(store: Store) -> None:
+    for contract in list_contracts():
+        name = contract.name  # type: ignore[attr-defined]
+        assert store.scan(name).collect().equals(schema_of(name).to_frame())
+        sql = f"SELECT count(*) AS n FROM {name}"  # noqa: S608 - the name is one of ours
+        assert store.query(sql)["n"].to_list() == [0]
+
+
+def test_scan_sees_the_current_generation_of_every_run(store: Store) -> None:
+    write_generation(store, "a", "k", 1)
+    write_generation(store, "a", "l", 2)
+    write_generation(store, "folder/b", "k", 3)
+    with store.open_generation("empty", "k") as generation:
+        generation.commit({})
+    expected = pl.concat([make_slip("a", 2), make_slip("folder/b", 3)])
+    assert_frame_equal(store.scan("slip").collect(), expected)
+    assert store.scan("quarantine_windows").collect()["run"].to_list() == ["a"] * 2 + ["folder/b"] * 2
+
+
+def test_scan_of_an_unknown_table_names_those_there_are(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"'speeds'.*velocities"):
+        store.scan("speeds")
+
+
+def test_query_joins_tables(store: Store) -> None:
+    write_generation(store, "a", "k", 1)
+    write_generation(store, "b", "k", 2)
+    found = store.query(
+        "SELECT s.run, count(*) AS n FROM slip s JOIN (SELECT DISTINCT run, step FROM windows) w "
+        "ON s.run = w.run AND s.step = w.step GROUP BY s.run ORDER BY s.run"
+    )
+    assert found.rows() == [("a", 500), ("b", 500)]
+
+
+@pytest.mark.parametrize("sql", ["SELECT", "SELECT * FROM speeds", "SELECT speed FROM slip"])
+def test_query_that_cannot_be_answered_says_so(store: Store, sql: str) -> None:
+    write_generation(store, "a", "k", 1)
+    with pytest.raises(StoreError) as caught:
+        store.query(sql)
+    assert caught.value.code == "bad_query"
+    assert "\n" not in str(caught.value)
+
+
+def test_query_over_a_file_that_is_gone_says_how_it_is_made_again(store: Store) -> None:
+    manifest = write_generation(store, "a", "k", 1)
+    manifest.path("slip").unlink()
+    with pytest.raises(StoreError, match=r"slip results verify --repair") as caught:
+        store.query("SELECT count(*) FROM slip")
+    assert (caught.value.code, caught.value.where) == ("file_missing", str(manifest.folder / "slip.parquet"))
+
+
+def inflate(path: Path, rows: int) -> None:
+    """Put a table of so many equal rows in the place of another: it takes hardly any bytes."""
+    schema = pq.read_schema(path)
+    one = pq.read_table(path).slice(0, 1).combine_chunks()
+    piece = pa.Table.from_arrays(
+        [pa.repeat(one.column(name)[0], 1 << 20) if not pa.types.is_dictionary(one.schema.field(name).type)
+         else pa.DictionaryArray.from_arrays(
+             pa.array(np.zeros(1 << 20, dtype=np.uint32)), one.column(name).chunk(0).dictionary)
+         for name in schema.names],
+        schema=schema,
+    )  # fmt: skip
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        for _ in range(rows >> 20):
+            writer.write_table(piece)
+
+
+@pytest.mark.parametrize("admits", [False, True], ids=["manifest is old", "manifest says so too"])
+def test_a_small_file_of_endless_rows_is_not_read(*, admits: bool, store: Store) -> None:
+    manifest = write_generation(store, "a", "k", 1)
+    path, rows = manifest.path("windows"), 4 << 20
+    inflate(path, rows)
+    assert path.stat().st_size < rows / 4
+    if admits:
+        entry = replace(manifest.tables["windows"], rows=rows)
+        rewrite(replace(manifest, tables={"windows": entry}))
+    for read in (
+        lambda: store.query("SELECT sum(samples) AS n FROM windows"),
+        lambda: store.manifests()[0].read("windows"),
+        lambda: store.scan("windows"),
+    ):
+        with pytest.raises(StoreError, match=rf"{rows} rows.*--force") as caught:
+            read()
+        assert caught.value.code == "table_damaged"
+
+
+@pytest.mark.parametrize(
+    "sql", ["DROP TABLE slip", "-- SELECT\n drop table slip", "SHOW TABLES", "SELECTED", ""]
+)
+def test_what_is_no_question_is_refused_and_removes_no_results(store: Store, sql: str) -> None:
+    write_generation(store, "a", "k", 1)
+    with pytest.raises(StoreError, match="does not begin with SELECT or WITH") as caught:
+        store.query(sql)
+    assert caught.value.code == "bad_query"
+    for asked in (
+        "select 500",
+        "(/* all\n */ SELECT 500 UNION SELECT 500)",
+        "-- how\nWITH a AS (SELECT 500) SELECT * FROM a",
+    ):
+        assert store.query(asked).rows() == [(500,)]
+    assert store.scan("slip").collect().height == 500
+
+
+def test_tables_of_an_older_contract_are_fitted(store: Store) -> None:
+    manifest = write_generation(store, "old", "k", 1)
+    write_generation(store, "new", "k", 2)
+    older = manifest.read("windows").drop("samples").with_columns(gone=1, segment=pl.lit(3, pl.Int64))
+    older.write_parquet(manifest.path("windows"))
+    entry = replace(manifest.tables["windows"], contract_version=0)
+    rewrite(replace(manifest, tables={"windows": entry}))
+
+    found = store.scan("windows").collect()
+    assert found.schema == schema_of("windows")
+    old = found.filter(pl.col("run") == "old")
+    assert old["samples"].null_count() == old.height == manifest.tables["windows"].rows
+    assert old["segment"].unique().to_list() == [3]
+    assert found.filter(pl.col("run") == "new")["samples"].unique().to_list() == [40]
+
+
+LONG = "x" * 4_000_000
+
+
+def repeat(count: int) -> pa.DictionaryArray:
+    """A long text many times, which takes the memory of one."""
+    return pa.DictionaryArray.from_arrays(pa.array([0] * count, pa.int32()), pa.array([LONG]))
+
+
+def list_in(rows: int, inner: pa.Array) -> pa.ListArray:
+    """Entries in lists of equal lengths."""
+    ends = np.linspace(0, len(inner), rows + 1).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(ends), inner)
+
+
+def write(path: Path, column: pa.Array, *, groups: int = 1, dictionary: bool = True) -> int:
+    """A table of one column, several times; its number of rows."""
+    table = pa.table({"text": column})
+    with pq.ParquetWriter(
+        path,
+        table.schema,
+        compression="zstd",
+        use_dictionary=dictionary,
+        dictionary_pagesize_limit=1 << 30,
+        store_schema=False,
+    ) as writer:
+        for _ in range(groups):
+            writer.write_table(table)
+    return groups * table.num_rows
+
+
+def repeat_text(path: Path) -> int:
+    return write(path, repeat(50), groups=20)
+
+
+def write_plainly(path: Path) -> int:
+    return write(path, pa.array([LONG] * 20), groups=2, dictionary=False)
+
+
+def list_texts(path: Path) -> int:
+    return write(path, list_in(20, repeat(2000)))
+
+
+def nest_texts(path: Path) -> int:
+    return write(path, list_in(20, pa.StructArray.from_arrays([repeat(2000)], ["inner"])))
+
+
+def list_numbers(path: Path) -> int:
+    return write(path, list_in(20, pa.array(np.zeros(20_000_000))))
+
+
+@pytest.mark.parametrize("make", [repeat_text, write_plainly, list_texts, nest_texts, list_numbers])
+def test_a_small_file_of_large_columns_is_refused_in_little_memory(
+    tmp_path: Path, make: Callable[[Path], int]
+) -> None:
+    path = tmp_path / "findings.parquet"
+    rows = make(path)
+    assert path.stat().st_size < 200_000
+    before = pa.default_memory_pool().max_memory()
+    with pytest.raises(StoreError, match=f"its {rows} rows inflate to more than") as caught:
+        check_size(path, rows)
+    assert caught.value.code == "table_damaged"
+    assert pa.default_memory_pool().max_memory() - before < 5e7
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        ["a vehicle of a season, by its whole name", "another"] * 350_000,
+        [["first_rule", "second_rule"]] * 100_000,
+        [None, "x"] * 5000,
+        ["x" * 1000 + str(number) for number in range(2000)],
+    ],
+    ids=["names", "rules", "nulls", "sentences"],
+)
+def test_texts_beside_numbers_are_read(tmp_path: Path, column: list[object]) -> None:
+    path = tmp_path / "slip.parquet"
+    numbers = np.random.default_rng(1).normal(size=len(column))
+    pq.write_table(pa.table({"text": pa.array(column), "number": numbers}), path, compression="zstd")
+    check_size(path, len(column))

@@ -4,16 +4,16 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from store_samples import forge_file
 from verbs import run_verb
 
-from pipeline.store.checksums import encode_checked
+from pipeline.store import Store
 
 RUN = "field/wide"
 VERBS = {
@@ -58,24 +58,14 @@ def change(content: object, place: Path_, odd: object, *, drop: bool) -> object:
 
 
 def store(results: Path, name: str, content: object) -> Path:
-    """Write a file of the run, and the manifest that agrees with it."""
-    home = results / "runs" / RUN
-    manifest = json.loads((home / "manifest.json").read_text())
-    data = json.dumps(content).encode()
-    path = home / manifest["folder"] / name
-    path.unlink()
-    path.write_bytes(data)
-    manifest.pop("checksum")
-    manifest["files"][name].update(sha256=sha256(data).hexdigest(), bytes=len(data))
-    (home / "manifest.json").write_bytes(encode_checked(manifest, indent=1))
-    return path
+    """Write a file of the run, bytes as they are, and the manifest that agrees with it."""
+    data = content if isinstance(content, bytes) else json.dumps(content).encode()
+    return forge_file(Store(results).manifests()[0], name, data)
 
 
 def read(results: Path, name: str) -> dict[str, Any]:
     """The content of a file of the run."""
-    home = results / "runs" / RUN
-    manifest = json.loads((home / "manifest.json").read_text())
-    content: dict[str, Any] = json.loads((home / manifest["folder"] / name).read_text())
+    content: dict[str, Any] = json.loads(Store(results).manifests()[0].path(name).read_text())
     return content
 
 
@@ -124,13 +114,7 @@ def test_another_word_for_the_kind_of_vehicle_is_one_line(folder: Path) -> None:
 @pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{", b"[" * 100_000, b'{"a": NaN}', b"null"])
 def test_a_file_that_is_no_object(folder: Path, data: bytes) -> None:
     for name in ("summary.json", "diagnosis.json"):
-        path = store(folder / "results", name, {})
-        home = folder / "results" / "runs" / RUN
-        manifest = json.loads((home / "manifest.json").read_text())
-        manifest.pop("checksum")
-        manifest["files"][name].update(sha256=sha256(data).hexdigest(), bytes=len(data))
-        path.write_bytes(data)
-        (home / "manifest.json").write_bytes(encode_checked(manifest, indent=1))
+        store(folder / "results", name, data)
     for verb in (*VERBS["summary.json"], *VERBS["diagnosis.json"]):
         judge(folder, verb, "")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from stored import make_once
-from workbench_server import TRACK, Workbench
+from workbench_server import TRACK, ServedWorkbench, Workbench
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -21,32 +21,34 @@ def hidden_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _analyze(folder: Path) -> None:
     out = folder / "field" / "hidden.mcap"
-    simulate_case(None, {"effective_track": TRACK}, out=out, seed=3, duration_s=90.0)
+    simulate_case(None, {"effective_track": TRACK}, out=out, seed=3, duration_s=60.0)
     analyze_log(out, Options(out=folder / "results", overrides={"vehicle": {"preset": "husky_a200"}}))
 
 
-@pytest.fixture(scope="session")
-def analyzed(hidden_log: Path) -> Path:
-    """Results of that log, to read only."""
-    return hidden_log.parents[1] / "results"
-
-
 @pytest.fixture
-def results(analyzed: Path, tmp_path: Path) -> Path:
+def results(hidden_log: Path, tmp_path: Path) -> Path:
     """Results of that log that a test may change."""
-    return Path(shutil.copytree(analyzed, tmp_path / "results"))
+    return Path(shutil.copytree(hidden_log.parents[1] / "results", tmp_path / "results"))
 
 
 @pytest.fixture
 def workbench(results: Path) -> Iterator[Workbench]:
-    server = Workbench(results)
-    yield server
-    server.close()
+    bench = Workbench(results)
+    yield bench
+    bench.close()
 
 
-@pytest.fixture(scope="session")
-def shared_workbench(analyzed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workbench]:
-    """For tests that leave the session as they found it."""
-    server = Workbench(Path(shutil.copytree(analyzed, tmp_path_factory.mktemp("shared") / "results")))
-    yield server
-    server.close()
+@pytest.fixture
+def served(results: Path) -> Iterator[ServedWorkbench]:
+    """For a browser."""
+    bench = ServedWorkbench(results)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def diagnosed(stored_run: Path) -> Iterator[Workbench]:
+    """Of a diagnosed run, `field/wide`, with two effects; to read only."""
+    bench = Workbench(stored_run / "results")
+    yield bench
+    bench.close()

@@ -1,31 +1,86 @@
 """The workbench in a real browser, as a person uses it: look, add, see the error fall, undo, drop, reload."""
 
 import json
+import os
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 import pytest
+from barriers import find_barriers
 from chrome import LAPTOP, PHONE, Chrome
-from workbench_server import ERROR, RUN, SHOWN, TOKEN, TRACK, Workbench, look_for_trouble
+from workbench_server import ERROR, RUN, SHOWN, TOKEN, ServedWorkbench, look_for_trouble
 
 from pipeline.analysis import Options
-from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.analyze import analyze_log, update_datasets
+from pipeline.datasets.deployments import draw_up_map
 from pipeline.logs.writer import LogWriter
-from pipeline.report import theme
+from pipeline.report.datasets_page import write_map
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
 START = 1_700_000_000_000_000_000
 EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"
+SETTLED = (
+    f"{SHOWN} && !document.querySelector('.pane.busy, .trying') &&"
+    " document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
+)
+TITLE = "document.querySelector('.title h2')?.textContent"
+WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+TOAST = "document.getElementById('toast')"
+END = "document.querySelector('.end')"
+GOOD = "rgb(0, 128, 95)"
+REACHED = """(() => {
+  const shown = [...document.querySelectorAll('button, a[href], input, select, summary')]
+    .filter((node) => node.checkVisibility({ visibilityProperty: true }) && !node.disabled);
+  return shown.filter((node) => node.tabIndex < 0).map((node) => node.outerHTML);
+})()"""
+CUT = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
+  const box = svg.getBoundingClientRect();
+  return [...svg.querySelectorAll('text')].filter((text) => {
+    const word = text.getBoundingClientRect();
+    return word.width && (word.left < box.left - 1 || word.right > box.right + 1);
+  }).map((text) => text.textContent);
+})"""
+OVERLAPPING = """(() => {
+  const rooms = ['.hero > *', '.glance > *', '.model > *', '.first-view > *', '.figures > *'];
+  const parts = [...document.querySelectorAll(rooms.join())]
+    .map((node) => [node.className || node.id, node.getBoundingClientRect()])
+    .filter(([, box]) => box.width && box.height);
+  const found = [];
+  for (const [i, [one, a]] of parts.entries()) for (const [other, b] of parts.slice(i + 1))
+    if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)
+      found.push([one, other]);
+  return found;
+})()"""
+
+
+def open_page(
+    chrome: Chrome, bench: ServedWorkbench, width: int = LAPTOP, *, state: str = SETTLED, dark: bool = False
+) -> None:
+    chrome.size(width, 900, dark=dark)
+    chrome.open(bench.address)
+    chrome.wait(state)
+
+
+def look(chrome: Chrome, picture: Path) -> None:
+    """Nothing went wrong, nothing is cut, overlaps or is wider than the screen, and nobody is kept out."""
+    chrome.run("scrollTo(0, 0)")
+    chrome.picture(picture, whole=True)
+    assert cast("int", chrome.run(WIDER)) <= 0
+    for flaws in (CUT, OVERLAPPING, REACHED):
+        assert chrome.run(flaws) == []
+    assert find_barriers(chrome) == []
+    look_for_trouble(chrome)
 
 
 def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
-    chrome: Chrome, workbench: Workbench, pictures: Path, tmp_path: Path
+    chrome: Chrome, served: ServedWorkbench, pictures: Path, tmp_path: Path
 ) -> None:
     chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
+    chrome.open(served.address)
     chrome.wait(SHOWN)
     before = cast("float", chrome.run(ERROR))
     chrome.picture(pictures / "workbench_opened.png")
@@ -75,21 +130,20 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
 
 @pytest.mark.long
 def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
-    chrome: Chrome, workbench: Workbench, pictures: Path
+    chrome: Chrome, served: ServedWorkbench, pictures: Path
 ) -> None:
     chrome.size(PHONE, 600)
-    chrome.open(f"{workbench.origin}/")
+    chrome.open(f"{served.origin}/")
     chrome.wait("document.readyState === 'complete' && document.body?.innerText")
     assert "slip serve" in str(chrome.run("document.body.innerText"))
     assert chrome.run("document.scripts.length") == 0
     chrome.picture(pictures / "workbench_refused.png")
     chrome.errors.clear()
 
-    chrome.size(LAPTOP, 900)
-    chrome.open(f"{workbench.address}#a={RUN}&b={RUN}")
+    chrome.open(f"{served.address}#a={RUN}&b={RUN}")
     chrome.wait(f"{SHOWN} && document.querySelector('[data-slot=b]')?.dataset.drawn")
     # The token is in neither the address nor the reach of a script; the runs are those of the address.
-    assert str(chrome.run("location.href")).startswith(f"{workbench.origin}/#")
+    assert str(chrome.run("location.href")).startswith(f"{served.origin}/#")
     assert TOKEN not in str(chrome.run("document.cookie + document.documentElement.outerHTML"))
     chrome.run("location.reload()")
     chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
@@ -97,23 +151,12 @@ def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
 
 
 @pytest.mark.long
-def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path) -> None:
-    log = tmp_path / "field" / "late.mcap"
-    simulate_case(None, {"effective_track": TRACK, "drive_lag": 0.3}, out=log, seed=4, duration_s=90.0)
-    husky = {"vehicle": {"preset": "husky_a200"}}
-    analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=True, overrides=husky))
-    with closing(Workbench(tmp_path / "out")) as workbench:
-        chrome.size(LAPTOP, 900)
-        chrome.open(workbench.address)
-        chrome.wait(SHOWN)
-        named = (
-            "[...document.querySelectorAll('.proposals li[data-named]')].map((entry) => entry.dataset.effect)"
-        )
+def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, stored_run: Path) -> None:
+    with closing(ServedWorkbench(stored_run / "results")) as served:
+        open_page(chrome, served, state=SHOWN)
+        named = "[...document.querySelectorAll('.proposals li[data-named]')].map((row) => row.dataset.effect)"
         assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
-        manifest = Store(tmp_path / "out").manifest("field/late")
-        assert manifest is not None
-        told = json.loads(manifest.path("summary.json").read_text())["diagnosis"]["where"][0]["text"]
-        assert told in str(chrome.run("document.querySelector('.where').textContent"))
+        assert str(chrome.run("document.querySelector('.where').textContent")).startswith("Where: ")
         chrome.click(".add-all")
         chrome.wait("document.querySelectorAll('.card').length === 2")
         chrome.click("[data-tab=effects]")
@@ -123,67 +166,143 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
 
 
 @pytest.mark.long
-def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
-    chrome: Chrome, workbench: Workbench
-) -> None:
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
+def test_what_is_refused_is_said_until_the_next_step(chrome: Chrome, served: ServedWorkbench) -> None:
+    open_page(chrome, served)
     # The list is drawn anew while effects are tried: chosen and said in one breath.
     chrome.run(
         "(() => { document.querySelector('select.catalogue').value = 'wheel_radius';"
         " document.querySelector('.add-chosen').click(); })()"
     )
-    chrome.wait("document.getElementById('toast').textContent.includes('is not supported by the data')")
+    chrome.wait(f"{TOAST}.textContent.includes('is not supported by the data')")
     assert chrome.run("document.querySelectorAll('.card').length") == 0
     chrome.click("#toast .anyway")
-    chrome.wait("document.querySelectorAll('.card').length === 1")
     chrome.wait("document.querySelector('.said').textContent === '+ effective wheel radius'")
     assert chrome.run("document.querySelector('select.catalogue').selectedIndex") == 0
-    errors = [text for text in chrome.errors if "422" not in text]
-    assert errors == []
+    chrome.click(".hero .save")
+    chrome.wait(f"{TOAST}.textContent.includes('saved')")
+    chrome.click("#toast .drop")
+    assert chrome.run(f"{TOAST}.hidden")
+    chrome.click(".hero .save")
+    chrome.wait(f"!{TOAST}.hidden")
+    chrome.click(".card .remove")
+    chrome.wait(f"!document.querySelector('.card') && {TOAST}.hidden && {SETTLED}")
+    write_formula(chrome, effect="mine", formula="c * v0", parameters="c [s] -1 .. 1")
+    chrome.wait(f"{TOAST}.textContent.includes('rad/s')")
+    # The browser notes a refused request by itself.
+    assert [text for text in chrome.errors if "422" not in text] == []
+
+
+def write_formula(chrome: Chrome, **fields: str) -> None:
+    chrome.run("document.querySelector('.formula summary').focus()")
+    chrome.press("Enter", 13)
+    for name, text in fields.items():
+        chrome.run(
+            f"document.querySelector('.formula').open = true,"
+            f" document.querySelector('.formula [name={name}]').focus()"
+        )
+        chrome.call("Input.insertText", text=text)
+    chrome.run("document.querySelector('.formula [name=channel]').value = 'v_w'")
+    chrome.run("document.querySelector('.formula button').click()")
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("width", "dark"),
-    [(PHONE, False), (LAPTOP, True)],
-    ids=["phone", "laptop-dark"],
-)
-def test_nothing_is_cut_or_overlaps(
-    chrome: Chrome, workbench: Workbench, pictures: Path, width: int, *, dark: bool
+@pytest.mark.parametrize("width", [PHONE, LAPTOP])
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_add_slide_undo_and_save(
+    chrome: Chrome, served: ServedWorkbench, pictures: Path, width: int, *, dark: bool
 ) -> None:
-    workbench.session(RUN, "add", effect="effective_track")
-    chrome.size(width, 844, dark=dark)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    chrome.picture(pictures / f"workbench_{width}{'_dark' if dark else ''}.png", whole=True)
-    assert (
-        cast("int", chrome.run("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
-        <= 0
-    )
-    cut = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
-      const box = svg.getBoundingClientRect();
-      return [...svg.querySelectorAll('text')].filter((text) => {
-        const word = text.getBoundingClientRect();
-        return word.width && (word.left < box.left - 1 || word.right > box.right + 1);
-      }).map((text) => text.textContent);
-    })"""
-    assert chrome.run(cut) == []
-    overlapping = """(() => {
-      const rooms = ['.hero > *', '.glance > *', '.model > *', '.first-view > *', '.figures > *'];
-      const parts = [...document.querySelectorAll(rooms.join())]
-        .map((node) => [node.className || node.id, node.getBoundingClientRect()])
-        .filter(([, box]) => box.width && box.height);
-      const found = [];
-      for (const [i, [one, a]] of parts.entries()) for (const [other, b] of parts.slice(i + 1))
-        if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)
-          found.push([one, other]);
-      return found;
-    })()"""
-    assert chrome.run(overlapping) == []
-    assert chrome.run("document.querySelector('.numbers').getBoundingClientRect().bottom < innerHeight")
+    open_page(chrome, served, width, dark=dark)
+    before = cast("float", chrome.run(ERROR))
+    look(chrome, pictures / f"workbench_opened_{width}_{dark}.png")
+    chrome.click(".proposals li[data-effect=effective_track] .add")
+    chrome.wait(f"document.querySelector('.card') && {ERROR} < {0.1 * before} && {SETTLED}")
+    chrome.drag("[data-figure=reach] svg", (0.3, 0.5), (0.5, 0.5))
+    chrome.wait("!document.querySelector('.marked').hidden")
+    look(chrome, pictures / f"workbench_added_{width}_{dark}.png")
+    chrome.click(".mark-clear")
+
+    # The error stays in sight, however far one scrolls, and undo moves nothing else.
+    drawn = "document.querySelector('[data-figure=trajectory]')"
+    chrome.run(f"{drawn}.scrollIntoView({{ block: 'center' }})")
+    place = f"{drawn}.getBoundingClientRect().top"
+    before_undo = cast("list[object]", chrome.run(f"[{place}, {drawn}.innerHTML]"))
+    glance = "(({ top, bottom }) => [top, bottom])(document.querySelector('.glance').getBoundingClientRect())"
+    top, bottom = cast("list[float]", chrome.run(glance))
+    assert 0.0 <= top < bottom < 300.0
+    chrome.run("document.querySelector('.formula').open = true")
+    chrome.run("document.querySelector('.undo').click()")
+    chrome.wait(f"!document.querySelector('.card') && Math.abs({ERROR} - {before}) < 1e-6")
+    chrome.wait(f"{drawn}.innerHTML !== {json.dumps(before_undo[1])}")
+    assert chrome.run(place) == pytest.approx(before_undo[0], abs=60.0)
+    assert chrome.run("document.querySelector('.formula').open")
+    chrome.run("document.querySelector('.redo').click()")
+    chrome.wait("document.querySelector('.card')")
+    # A value at its bound is said and red.
+    served.session(RUN, "set", effect="effective_track", parameter="k", value=10.0)
+    chrome.run("location.reload()")
+    chrome.wait("document.querySelector('.bound')?.innerText.includes('at its bound')")
+    chrome.click(".card .remove")
+    chrome.wait(f"!document.querySelector('.card') && {SETTLED}")
+    write_formula(chrome, effect="my_track", formula="k * w0", parameters="k [1] -0.9 .. 0.9")
+    chrome.wait("document.querySelector('.card[data-effect=my_track]')")
     look_for_trouble(chrome)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("width", [LAPTOP, PHONE])
+def test_two_models_and_their_difference(
+    chrome: Chrome, served: ServedWorkbench, pictures: Path, width: int
+) -> None:
+    served.session(RUN, "add", effect="effective_track")
+    open_page(chrome, served, width)
+    # Beside a model with an effect stands the ideal one: two things that differ.
+    chrome.click("#compare")
+    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
+    chrome.wait(SETTLED)
+    cells = "[...document.querySelectorAll('#difference tbody tr')].map((row) => row.innerText)"
+    rows = cast("list[str]", chrome.run(cells))
+    assert rows[1].startswith("heading error over 2 s [\u00b0]")
+    first, second, apart = (text.split()[0] for text in rows[1].split("\t")[1:])
+    assert float(apart) == pytest.approx(float(second) - float(first), rel=0.01)
+    assert "effective_track" in rows[2]
+    assert "not in it" in rows[2]
+    # When they are apart: two lines over time, which follow both models, of one run only.
+    lines = "[...document.querySelectorAll('#apart .mark-line path')].map((line) => line.getAttribute('d'))"
+    chrome.wait(f"{lines}.length === 2 && {lines}[0] !== {lines}[1]")
+    before = cast("list[str]", chrome.run(lines))
+    chrome.click("[data-slot=b] .proposals li[data-effect=effective_track] .add")
+    chrome.wait(f"{lines}[1] !== {json.dumps(before[1])}")
+    chrome.wait(SETTLED)
+    assert chrome.run(f"{lines}[0]") == before[0]
+    look(chrome, pictures / f"flow_compared_{width}.png")
+    assert find_barriers(chrome) == []
+
+
+@pytest.mark.long
+def test_an_empty_folder_asks_for_a_log_and_says_what_is_none(
+    chrome: Chrome, pictures: Path, tmp_path: Path
+) -> None:
+    with closing(ServedWorkbench(tmp_path / "nothing yet")) as served:
+        open_page(chrome, served, PHONE, state="document.querySelector('.blank')")
+        assert not (tmp_path / "nothing yet").exists()
+        assert chrome.run("document.querySelector('#drop').getBoundingClientRect().height > 80")
+        look(chrome, pictures / "workbench_empty.png")
+        bad = tmp_path / "notes.mcap"
+        bad.write_bytes(b"this is no recording\n" * 100)
+        chrome.drop(bad, "#drop")
+        chrome.wait("document.querySelector('.job.failed p')")
+        told = str(chrome.run("document.querySelector('.job.failed').innerText"))
+        assert "notes.mcap" in told
+        assert str(served.results) not in told
+        # The page reads its lists anew once a job has ended.
+        time.sleep(1.0)
+        chrome.run("document.querySelector('.job.failed .drop').click()")
+        chrome.wait("!document.querySelector('.job.failed')")
+        chrome.click(".sample")
+        chrome.wait("document.querySelector('.job')")
+        chrome.wait(SETTLED, patience_s=180.0)
+        assert chrome.run(TITLE) == "dropped/husky_tile"
+        look_for_trouble(chrome)
 
 
 @pytest.mark.long
@@ -211,89 +330,114 @@ def test_markup_in_a_log_is_shown_as_text(chrome: Chrome, tmp_path: Path, pictur
     results = tmp_path / "results"
     outcome = analyze_log(log, Options(out=results))
     assert EVIL in str(outcome.summary["terrain"])
-    server = Workbench(results)
-    try:
-        chrome.size(LAPTOP, 900)
-        chrome.open(server.address)
-        chrome.wait(SHOWN)
-        chrome.picture(pictures / "workbench_markup.png")
+    with closing(ServedWorkbench(results)) as served:
+        open_page(chrome, served, state=SHOWN)
         assert EVIL in str(chrome.run("document.querySelector('.hero .facts').textContent"))
-        assert "<img src=x" in str(chrome.run("document.querySelector('.title h2').textContent"))
-        assert chrome.run("document.querySelectorAll('img, b[onclick]').length") == 0
-        assert chrome.run("window.pwned ?? null") is None
+        assert "<img src=x" in str(chrome.run(TITLE))
         look_for_trouble(chrome)
-        report = Path(str(outcome.summary["report"]))
-        chrome.open(report.as_uri())
-        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
-        chrome.picture(pictures / "report_markup.png", whole=True)
-        assert EVIL in str(chrome.run("document.body.textContent"))
-        assert chrome.run("document.querySelectorAll('img').length") == 0
-        assert chrome.run("window.pwned ?? null") is None
-        assert chrome.errors == []
-    finally:
-        server.close()
+        pages = [str(chrome.run("location.href")), Path(str(outcome.summary["report"])).as_uri()]
+        for number, page in enumerate(pages):
+            chrome.open(page)
+            chrome.wait(f"document.documentElement?.dataset.drawn === 'yes' || {SHOWN}")
+            chrome.picture(pictures / f"markup_{number}.png", whole=True)
+            assert EVIL in str(chrome.run("document.body.textContent"))
+            assert chrome.run("document.querySelectorAll('img, b[onclick]').length") == 0
+            assert chrome.run("window.pwned ?? null") is None
+            assert chrome.errors == []
 
 
 @pytest.mark.long
-def test_an_empty_folder_asks_for_a_log(chrome: Chrome, tmp_path: Path, pictures: Path) -> None:
-    server = Workbench(tmp_path / "nothing yet")
-    try:
-        chrome.size(PHONE, 844)
-        chrome.open(server.address)
-        chrome.wait("document.querySelector('.blank')")
-        chrome.picture(pictures / "workbench_empty.png")
-        assert chrome.run("document.querySelector('#drop').getBoundingClientRect().height > 80")
-        look_for_trouble(chrome)
-    finally:
-        server.close()
-    assert not (tmp_path / "nothing yet").exists()
-
-
-SLOW_LISTS = """(() => {
-  const ask = window.fetch;
-  window.fetch = async (address, ...rest) => {
-    if (String(address).startsWith("/api/runs")) await new Promise((done) => setTimeout(done, 2000));
-    return ask(address, ...rest);
-  };
-})()"""
-
-
-@pytest.mark.long
-def test_a_drive_is_planned_on_request_and_its_files_are_there(
-    chrome: Chrome, pictures: Path, tmp_path: Path
+@pytest.mark.parametrize("is_served", [True, False], ids=["served", "from_files"])
+def test_a_report_leads_to_all_runs_and_they_lead_back(
+    chrome: Chrome, served: ServedWorkbench, results: Path, *, is_served: bool
 ) -> None:
-    hidden: dict[str, object] = {"effective_track": 1.6, "drive_lag": 0.25, "lateral_skid": 0.1}
-    log = simulate_case(
-        None, hidden, out=tmp_path / "circle.mcap", seed=9, duration_s=40.0, vehicle="husky", program="circle"
-    )
+    update_datasets(Store(results))
+    if is_served:
+        chrome.open(served.address)
+        chrome.wait("document.querySelector('main')")
+        chrome.open(f"{served.origin}/report?run={RUN}")
+    else:
+        chrome.open(next(results.glob("runs/**/report.html")).as_uri())
+    for _ in range(2):
+        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+        chrome.click("#pages a")
+        chrome.wait("document.querySelector('#shown')?.textContent === '1 of 1 runs'")
+        chrome.click("tbody th a")
+    chrome.wait(f"document.querySelector('h1')?.textContent === {json.dumps(RUN)}")
+
+    # No page is offered that is not there; what is made later is reached by way of all runs.
+    report = str(chrome.run("location.href"))
+    offered = "[...document.querySelectorAll('#pages a')].map((link) => link.textContent)"
+    assert chrome.run(offered) == ["All runs"]
+    write_map(Store(results), draw_up_map(Store(results)))
+    chrome.open(report)
+    chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+    chrome.click("#pages a")
+    chrome.wait(f"{offered}.join() === 'Map'")
+    chrome.click("#pages a")
+    chrome.wait("document.querySelector('h1')?.textContent === 'Deployment map'")
+    assert chrome.errors == []
+
+
+@pytest.mark.long
+def test_on_a_phone_the_next_effect_is_in_reach_and_the_end_is_said(
+    chrome: Chrome, served: ServedWorkbench, pictures: Path
+) -> None:
+    chrome.size(PHONE, 844)
+    chrome.open(served.address)
+    chrome.wait(f"{SHOWN} && document.querySelector('.reach .add')")
+    before = cast("float", chrome.run(ERROR))
+    assert "times the noise floor; largest from" in str(chrome.run(f"{END}.textContent"))
+    assert chrome.run(f"getComputedStyle({END}).color") != GOOD
+    button = "document.querySelector('.reach .add').getBoundingClientRect()"
+    for top in (0, 800, 100_000):
+        chrome.run(f"scrollTo(0, {top})")
+        assert chrome.run(f"{button}.top > 0 && {button}.bottom <= innerHeight"), top
+    chrome.click(".reach .add")
+    chrome.wait(f"{ERROR} < {0.1 * before}")
+    chrome.wait(f"{END}.textContent === 'Done: at the noise floor'")
+    assert chrome.run(f"getComputedStyle({END}).color") == GOOD
+    # What the effect is stands on its card; where nothing changed, this is said.
+    assert "turns less than" in str(chrome.run("document.querySelector('.card .about').textContent"))
+    chrome.picture(pictures / "loop_phone.png")
+    look_for_trouble(chrome)
+
+
+@pytest.mark.long
+def test_one_moment_shows_in_path_velocities_and_map_and_can_be_played(
+    chrome: Chrome, served: ServedWorkbench
+) -> None:
+    marked = "[...document.querySelectorAll('.cursor-mark')].map((mark) => mark.parentElement.dataset.figure)"
+    said = "document.querySelector('.moment-said').textContent"
+    chrome.size(LAPTOP, 900)
+    chrome.open(served.address)
+    chrome.wait(f"{SHOWN} && document.querySelector('[data-figure=trajectory].drawn')")
+    chrome.click(".end .look")
+    chrome.wait(f"new Set({marked}).size >= 3")
+    assert {"paths", "stretch", "trajectory"} <= set(cast("list[str]", chrome.run(marked)))
+    told = str(chrome.run(said))
+    assert "cm off" in told
+    assert "Marked" in str(chrome.run("document.querySelector('.marked').innerText"))
+    chrome.click(".play")
+    chrome.wait(f"parseFloat({said}) > {float(told.split(maxsplit=1)[0]) + 1.0}")
+    chrome.click(".play")
+    look_for_trouble(chrome)
+
+
+@pytest.mark.long
+def test_it_opens_with_the_run_that_was_analyzed_last_also_one_that_cannot_show_slip(
+    chrome: Chrome, results: Path, tmp_path: Path
+) -> None:
+    log = simulate_case(None, {"wheel_radius": 0.0}, out=tmp_path / "field" / "lifted.mcap", duration_s=40.0)
     husky = {"vehicle": {"preset": "husky_a200"}}
-    analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=True, overrides=husky))
-    with closing(Workbench(tmp_path / "out")) as workbench:
-        chrome.size(LAPTOP, 900)
-        chrome.open(workbench.address)
-        chrome.wait("document.querySelector('.plan .ask button')")
-        # The next drive is ordered while the page still reads its lists anew after the one that failed.
-        chrome.run(SLOW_LISTS)
-        chrome.run("document.querySelector('.plan input').value = '1x1m'")
-        chrome.click(".plan .ask button")
-        chrome.wait("document.querySelector('.job.failed p')?.textContent.includes('area')")
-        chrome.run("document.querySelector('.plan input').value = '20x10m'")
-        chrome.click(".plan .ask button")
-        chrome.wait("document.querySelector('.planned .plot.drawn')", patience_s=60.0)
-        assert "centre of rotation" in str(chrome.run("document.querySelector('.planned table').textContent"))
-        run = workbench.get("/api/runs")["runs"][0]["run"]  # type: ignore[index]
-        for name, start in (("plan.mcap", b"\x89MCAP"), ("plan.html", b"<!doctype html>")):
-            status, _, body = workbench.request("GET", f"/plan?run={run}&file={name}")
-            assert status == 200
-            assert body[: len(start)].lower() == start.lower()
-        for width, dark in ((LAPTOP, False), (PHONE, False), (PHONE, True)):
-            chrome.size(width, 900, dark=dark)
-            # Drawn anew for the width and the colours.
-            twin = theme.DARK_TWINS[theme.GRID] if dark else theme.GRID
-            chrome.wait(f"document.querySelector('.planned svg').outerHTML.includes('{twin}')")
-            chrome.wait("document.querySelector('.planned svg').clientWidth <= innerWidth")
-            chrome.run("document.querySelector('.planned').scrollIntoView()")
-            assert chrome.run("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
-            chrome.picture(pictures / f"workbench_plan_{width}_{'dark' if dark else 'light'}.png")
-        chrome.wait(SHOWN, patience_s=60.0)
+    analyze_log(log, Options(out=results, report=False, diagnosis=False, overrides=husky))
+    written = {one.run: one.folder.parent / "manifest.json" for one in Store(results).manifests()}
+    with closing(ServedWorkbench(results)) as served:
+        for newest in (RUN, "field/lifted"):
+            os.utime(written[newest])
+            open_page(chrome, served, state=f"{TITLE} === {json.dumps(newest)} && {SHOWN}")
+            chrome.open("about:blank")
+        open_page(chrome, served, state=f"{SHOWN} && document.querySelector('.no-help')")
+        # Of a run that cannot show slip, no error is said to remain.
+        assert chrome.run(f"{END}.offsetHeight") == 0
         look_for_trouble(chrome)

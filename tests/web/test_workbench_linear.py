@@ -15,8 +15,8 @@ from pipeline.models.parameter import parse_unit
 from pipeline.sources import Signal, candidates, read_description
 from pipeline.sources import layers as sources
 from pipeline.stages import drive, pose_choice
-from pipeline.web.session import make_formula
-from pipeline.web.stored_runs import clean_name
+from pipeline.web.cards import make_formula
+from pipeline.web.jobs import clean_name
 
 LENGTH = 1_000_000
 LONGEST_S = 3.0

@@ -1,35 +1,16 @@
-"""Figures: their definition, their discovery, and their common parts.
+"""Figures of a run: what a figure is, and the parts that figures share."""
 
-One file each; they are found by being in this folder.
-"""
-
-import functools
-import importlib
-import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import Literal
+from typing import Any
 
-import numpy as np
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, suffix_unit
 from pipeline.models import name_effect
 from pipeline.report import Picture, format_number, theme
 from pipeline.report.scene import Scene, Thinned
-from pipeline.report.theme import Channel, Chart, Drawing, Range, encode_column, layer, make_axis
-
-
-class Section(Enum):
-    """Question of the page that a figure answers."""
-
-    GLANCE = "glance"
-    WHY = "why"
-    EFFECT = "effect"
-    WHERE = "where"
-    HOW_BAD = "how-bad"
-    REST = "rest"
+from pipeline.report.theme import Channel, Chart, Drawing, encode_column, find_range, layer, make_axis
 
 
 @dataclass(frozen=True)
@@ -37,54 +18,35 @@ class Figure:
     """Figure that any run may have.
 
     Attributes:
-        title: what it shows, in a few words.
-        section: the question it answers.
-        draw: the function from tables to a drawing, which returns None if there is nothing to draw; None for
-            a figure of panels.
-        order: position within the section, in ascending order; figures of half the width may come first.
         id: stable name.
-        width: share of a wide page's width.
-        panels: drawings by the id of an effect, for a figure that has one for each.
+        title: what it shows, in a few words.
+        draw: from tables to a drawing, or to one for each effect by its id; None if there is nothing to draw.
+        width: share of a wide page's width, `half` or `full`.
         live: names of its rows that change with the model of the run.
     """
 
-    title: str
-    section: Section
-    draw: Callable[[Scene], Drawing | None] | None
-    order: int
     id: str
-    width: Literal["half", "full"] = "half"
-    panels: Callable[[Scene], Mapping[str, Drawing]] | None = None
+    title: str
+    draw: Callable[[Scene], Drawing | Mapping[str, Drawing] | None]
+    width: str = "half"
     live: Callable[[Scene], Mapping[str, pl.DataFrame]] | None = None
-
-
-@functools.cache
-def list_figures() -> tuple[Figure, ...]:
-    """All figures of this folder, in the order of the page."""
-    folder = importlib.import_module("pipeline.report.figures")
-    figures = []
-    for module in pkgutil.iter_modules(folder.__path__):
-        content = vars(importlib.import_module(f"{folder.__name__}.{module.name}"))
-        figures += [value for value in content.values() if isinstance(value, Figure)]
-    sections = list(Section)
-    return tuple(
-        sorted(figures, key=lambda figure: (sections.index(figure.section), figure.order, figure.id))
-    )
 
 
 def draw_figure(figure: Figure, scene: Scene) -> list[Picture]:
     """The pictures of a figure, one for each of its parts; empty if there is nothing to draw."""
-    if figure.panels is not None:
+    drawn = figure.draw(scene)
+    if isinstance(drawn, Mapping):
         return [
-            Picture(f"{figure.id}-{name}", name_effect(name), panel, figure.width)
-            for name, panel in figure.panels(scene).items()
+            Picture(f"{figure.id}-{name}", name_effect(name), one, figure.width)
+            for name, one in drawn.items()
         ]
-    drawing = None if figure.draw is None else figure.draw(scene)
-    return [] if drawing is None else [Picture(figure.id, figure.title, drawing, figure.width)]
+    return [] if drawn is None else [Picture(figure.id, figure.title, drawn, figure.width)]
 
 
-WIDTH = 720
+WIDTH, MAP_WIDTH = 720, 480
 GUTTER = 46
+_MARGIN = 0.05
+_SMALLEST_SPAN_M = 1.0
 
 SERIES_WORDS = {
     "velocity": "measured",
@@ -98,137 +60,154 @@ MARKED_SPANS = "marked_spans"
 MARKED_POINTS = "marked_points"
 SHOWN_SPAN = "shown_span"
 
-BAR_STEP = 44
-_BAR, _BAR_BELOW, _WORDS_ABOVE = 15, 9, -10
+BAR_STEP, BAR_BELOW = 44, 9
+_BAR, _WORDS_ABOVE = 15, -10
 
-_EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
-_EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", "modulus"), pl.Float64))
-
-
-def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> Channel:
-    """Time axis of every figure over time; without a title it has no labels either."""
-    scale = {"domain": list(scene.time_domain or (0, 1)), "nice": False, "zero": False}
-    return make_axis("t", title, scale=scale, tickCount=8, labels=title is not None, grid=False)
+EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
+EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", "modulus"), pl.Float64))
 
 
-def value_axis(shown: Range) -> Channel:
-    """Vertical axis without a title (the panel's title states quantity and unit)."""
-    scale = {"domain": [shown.low, shown.high], "nice": shown.beyond is None}
-    return make_axis("value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
+def time_axis(
+    scene: Scene, span: tuple[float, float] | None = None, *, has_title: bool = True, ticks: int = 8
+) -> Channel:
+    """Axis of time over the whole run or a span of it; without a title it has no labels either."""
+    scale = {"domain": list(span or scene.time_domain or (0, 1)), "nice": False, "zero": False}
+    title = "time since the start of the run [s]" if has_title else None
+    return make_axis("t", title, scale=scale, tickCount=ticks, labels=has_title, grid=False)
 
 
-def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
-    """Title of a panel: quantity and unit; below, the range of peaks beyond the axis."""
-    if shown.beyond is None:
-        return {"text": f"{quantity} [{unit}]"}
-    value, time = shown.beyond
-    return {
-        "text": f"{quantity} [{unit}]",
-        "subtitle": (
-            f"peaks cut; the furthest is {format_number(value)}{suffix_unit(unit)} at {format_number(time)} s"
-        ),
-    }
+def make_map(
+    places: pl.DataFrame, origin: tuple[float, float], heights: tuple[float, float]
+) -> tuple[Channel, Channel, dict[str, Any]]:
+    """Axes of a map on which x and y have the same scale.
+
+    Args:
+        places: all ``x`` and ``y`` [m] that the map contains.
+        origin: what was subtracted from them [m].
+        heights: smallest and largest height of the map [px].
+
+    Returns:
+        The axes; and width and height of the chart, with the metadata that let the page fit both to its room.
+    """
+    middles, spans = [], []
+    for name in "xy":
+        low, high = float(places[name].min() or 0.0), float(places[name].max() or 0.0)  # type: ignore[arg-type]
+        middles.append((low + high) / 2.0)
+        spans.append(max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN))
+    height = round(min(max(MAP_WIDTH * spans[1] / spans[0], heights[0]), heights[1]))
+    metres = max(spans[0] / MAP_WIDTH, spans[1] / height)
+    equal: dict[str, object] = {"lowest": heights[0], "highest": heights[1]}
+    axes = []
+    for name, middle, span, pixels, offset in zip(
+        "xy", middles, spans, (MAP_WIDTH, height), origin, strict=True
+    ):
+        equal[name] = [round(middle - span / 2.0, 4), round(middle + span / 2.0, 4)]
+        half, less = metres * pixels / 2.0, f", less {offset:,.0f} m" if offset else ""
+        scale = {"domain": [middle - half, middle + half], "nice": False, "zero": False}
+        title = f"{name} in the map{less} [m]"
+        axes.append(make_axis(name, title, scale=scale, tickCount=5, minExtent=GUTTER - 20))
+    meta = {"gutter": GUTTER + 4, "equal": equal}
+    return axes[0], axes[1], {"width": MAP_WIDTH, "height": height, "usermeta": meta}
 
 
 def draw_lines(
-    scene: Scene, names: list[str], shown: Range, colour: Channel, x: Channel | None = None
+    names: Sequence[str],
+    lines: pl.DataFrame,
+    usual: tuple[float, float],
+    quantity: tuple[str, str],
+    colour: Channel,
+    *,
+    x: Channel,
+    height: int,
+    bands: Sequence[Chart] | None = None,
+    room: float = 0.0,
+    stroke: float = 1.2,
 ) -> Chart:
-    """Draw lines of `names` over time in front of the bands; the caller sets title and height."""
-    lines = [
-        Chart.of_rows(name)
-        .mark("line", clip=True, order=False)
-        .encode(x=x or time_axis(scene), y=value_axis(shown), color=colour)
-        for name in names
-    ]
-    return layer(*shade_spans(), *lines).properties(width=WIDTH)
-
-
-def shade_spans() -> list[Chart]:
-    """Bands over the full height of a panel: after a change of command, suspect, marked by the user."""
-    bands = (
-        ("transitory", theme.SHADE, 1.0),
-        ("suspect", theme.SUSPECT, 1.0),
-        (MARKED_SPANS, theme.MARK, 0.2),
-    )
-    return [
-        Chart.of_rows(name)
-        .mark("rect", color=colour, opacity=opacity, clip=True)
-        .encode(x="t_start:Q", x2="t_end:Q")
-        for name, colour, opacity in bands
-    ]
-
-
-@dataclass(frozen=True)
-class NamedBars:
-    """Bars over the whole width, each below its name and values; variable channels must be encoded.
-
-    Attributes:
-        bars: the bars.
-        ticks: short lines across single bars.
-        rules: lines along the bars.
-        words: the names and values.
-    """
-
-    bars: Chart
-    ticks: Chart
-    rules: Chart
-    words: Chart
-
-
-def name_bars(rows: str, name: str) -> NamedBars:
-    """Make bars labelled by the columns ``name`` and ``told``, in the order of the rows.
+    """Draw a panel of lines over time in front of bands; isolated peaks beyond its axis are told.
 
     Args:
-        rows: name of the rows.
+        names: names of the rows of the lines.
+        lines: rows that the vertical axis is made for, with ``t`` [s] and ``value``.
+        usual: their range without isolated peaks.
+        quantity: what the panel shows, and its unit.
+        colour: colour of each series.
+        x: axis of time.
+        height: of the panel [px].
+        bands: bands behind the lines; None for all of `shade_spans`.
+        room: free margin above and below, as a fraction of the range of the lines.
+        stroke: width of the lines [px].
+    """
+    low, high, beyond = find_range(lines, usual)
+    margin = room * (high - low)
+    scale = {"domain": [low - margin, high + margin], "nice": beyond is None}
+    y = make_axis("value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
+    title = {"text": f"{quantity[0]} [{quantity[1]}]"}
+    if beyond is not None:
+        furthest, time = f"{format_number(beyond[0])}{suffix_unit(quantity[1])}", format_number(beyond[1])
+        title["subtitle"] = f"peaks cut; the furthest is {furthest} at {time} s"
+    drawn = [
+        Chart.of_rows(name)
+        .mark("line", clip=True, order=False, strokeWidth=stroke)
+        .encode(x=x, y=y, color=colour)
+        for name in names
+    ]
+    behind = shade_spans() if bands is None else bands
+    return layer(*behind, *drawn).properties(width=WIDTH, height=height, title=title)
+
+
+def shade_spans(*names: str) -> list[Chart]:
+    """Bands over the full height of a panel, all or those of these names, as in `span_rows`."""
+    bands = {"transitory": (theme.SHADE, 1.0), "suspect": (theme.SUSPECT, 1.0)}
+    bands |= {MARKED_SPANS: (theme.MARK, 0.2), SHOWN_SPAN: (theme.MARK, 0.35)}
+    return [
+        Chart.of_rows(name)
+        .mark("rect", color=bands[name][0], opacity=bands[name][1], clip=True)
+        .encode(x="t_start:Q", x2="t_end:Q")
+        for name in names or ("transitory", "suspect", MARKED_SPANS)
+    ]
+
+
+def name_bars(rows: str, name: str) -> tuple[Chart, Chart, Chart]:
+    """Bars over the whole width, each below its name and values, in the order of the rows.
+
+    Args:
+        rows: name of the rows, with a column ``told``, which is written beside the name.
         name: name of the column with the names.
+
+    Returns:
+        The rows without a mark, the bars, which have no ends yet, and the names.
     """
     y = encode_column(f"{name}:N", sort=None, scale={"padding": 0}, axis=None)
     base = Chart.of_rows(rows).encode(y=y)
-    words = base.calculate("words", f"datum.{name} + '  \u00b7  ' + datum.told")
-    return NamedBars(
-        bars=base.mark("bar", size=_BAR, yOffset=_BAR_BELOW, clip=True),
-        ticks=base.mark(
-            "point",
-            shape="stroke",
-            angle=90,
-            size=(_BAR + 3) ** 2,
-            stroke=theme.INK,
-            strokeWidth=1.5,
-            opacity=1,
-            yOffset=_BAR_BELOW,
-        ),
-        rules=base.mark("rule", color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
-        words=words.mark("text", align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
-            x={"value": 0}, text="words:N"
-        ),
+    text = {"expr": f"datum.{name} + '  \u00b7  ' + datum.told"}
+    words = base.mark("text", align="left", dy=_WORDS_ABOVE, fontSize=12, text=text)
+    return (
+        base,
+        base.mark("bar", size=_BAR, yOffset=BAR_BELOW, clip=True),
+        words.encode(x={"value": 0}),
     )
 
 
-def series_colour(names: list[str], words: dict[str, str]) -> Channel:
-    """Colour of each series, the same in every figure, with texts in the legend."""
-    label = " : ".join(f"datum.value === '{name}' ? '{words[name]}'" for name in names)
-    scale = {"domain": names, "range": [SERIES_COLOURS[name] for name in names]}
-    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "stroke", "symbolSize": 220}
-    return encode_column("series:N", scale=scale, legend=legend)
-
-
-def before_and_after(input_name: str) -> Channel:
-    """Colours of the ideal model on an input and of the model, with a legend."""
-    scale = {
-        "domain": ["ideal", "model"],
-        "range": [theme.INPUT_COLOURS.get(input_name, theme.QUIET), theme.MODEL],
-    }
-    words = INPUT_WORDS.get(input_name, "")
-    label = f"datum.value === 'ideal' ? 'ideal {words}' : 'model'"
+def series_colour(
+    words: Mapping[str, str], colours: Mapping[str, str] = SERIES_COLOURS, symbol: str = "stroke"
+) -> Channel:
+    """Colour of each series, the same in every figure, with these words in the legend."""
+    label = " : ".join(f"datum.value === '{name}' ? '{text}'" for name, text in words.items())
+    scale = {"domain": list(words), "range": [colours[name] for name in words]}
     legend = {
         "title": None,
-        "labelExpr": label,
-        "symbolType": "stroke",
-        "symbolSize": 220,
+        "labelExpr": f"{label} : datum.value",
+        "symbolType": symbol,
+        "symbolSize": 220 if symbol == "stroke" else 60,
         "symbolOpacity": 1,
-        "symbolStrokeWidth": 2.5,
     }
     return encode_column("series:N", scale=scale, legend=legend)
+
+
+def before_and_after(source: str) -> Channel:
+    """Colours of the ideal model on an input and of the model, with a legend."""
+    colours = {"ideal": theme.INPUT_COLOURS.get(source, theme.QUIET), "model": theme.MODEL}
+    return series_colour({"ideal": f"ideal {INPUT_WORDS.get(source, '')}", "model": "model"}, colours)
 
 
 def slip_colour(scene: Scene) -> Channel:
@@ -261,109 +240,22 @@ def brush_over_plane(x: str, y: str) -> dict[str, object]:
 
 
 def span_rows(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows of `shade_spans`."""
-    return {"transitory": scene.transitory_spans, "suspect": scene.suspect_spans, MARKED_SPANS: _EMPTY_SPANS}
+    """Rows of bands: after a change of command, suspect, and marked by the user, at first none."""
+    return {"transitory": scene.transitory_spans, "suspect": scene.suspect_spans, MARKED_SPANS: EMPTY_SPANS}
 
 
-def marked_rows() -> dict[str, pl.DataFrame]:
-    """Rows of the points marked by the user: initially empty."""
-    return {MARKED_POINTS: _EMPTY_POINTS}
-
-
-def format_bands(scene: Scene) -> str:
-    """Explain the bands that exist."""
-    sentences = []
-    if not scene.transitory_spans.is_empty():
-        sentences.append("Grey bands: transitory, after a change of command.")
-    if not scene.suspect_spans.is_empty():
-        sentences.append("Red bands: incidents and suspect poses, left out of medians and fits.")
-    return " ".join(sentences)
+def format_bands(scene: Scene, *lines: Thinned) -> str:
+    """Explain the bands that exist, and which points of lines are drawn."""
+    texts = (
+        (scene.transitory_spans, "Grey bands: transitory, after a change of command."),
+        (scene.suspect_spans, "Red bands: incidents and suspect poses, left out of medians and fits."),
+    )
+    thinned = format_thinning(*lines, rule="first, last, lowest and highest of every bin")
+    return " ".join(filter(None, [*(text for spans, text in texts if not spans.is_empty()), thinned]))
 
 
 def format_thinning(*lines: Thinned, rule: str) -> str:
     """Sentence about omitted points; empty if there are none."""
     drawn, total = sum(line.drawn for line in lines), sum(line.total for line in lines)
-    if drawn >= total:
-        return ""
-    return f"Drawn from {drawn:,} of {total:,} points: {rule}, so no peak is lost."
-
-
-_POINTS = 201
-_HIGHEST_SHOWN = 0.995
-
-
-def tabulate_shares(values: dict[str, pl.Series]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Cumulative distributions and medians of each series.
-
-    Args:
-        values: samples [m/s] by input; none of them empty.
-
-    Returns:
-        Long curves ``value share series`` up to the 99.5th percentile, and medians ``value share series``.
-    """
-    shares = np.linspace(0.0, _HIGHEST_SHOWN, _POINTS)
-    curves, medians = [], []
-    for name, series in values.items():
-        numbers = series.to_numpy()
-        curve = pl.DataFrame({"value": np.quantile(numbers, shares), "share": shares})
-        curves.append(curve.with_columns(series=pl.lit(name)))
-        medians.append({"value": float(np.median(numbers)), "share": 0.5, "series": name})
-    return pl.concat(curves), pl.DataFrame(medians)
-
-
-def draw_shares(
-    name: str, values: dict[str, pl.Series], what: str, *, of: str = "", note: str = ""
-) -> Drawing:
-    """Draw distributions called ``name`` and medians called ``<name>_medians``, listed in the legend.
-
-    Args:
-        name: name of the rows.
-        values: samples [m/s] by input; none of them empty.
-        what: name of the quantity.
-        of: addition to this name, for the axis.
-        note: note of the drawing.
-    """
-    curves, medians = tabulate_shares(values)
-    words = {
-        row["series"]: f"{INPUT_WORDS[row['series']]}, median {row['value']:.2f} m/s"
-        for row in medians.iter_rows(named=True)
-    }
-    colour, whole = series_colour(list(words), words), {"domain": [0, 1]}
-    curve = (
-        Chart.of_rows(name)
-        .mark("line", strokeWidth=2)
-        .encode(
-            x=make_axis("value", f"{what}{of} [m/s]", tickCount=6, grid=False),
-            y=make_axis("share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
-            color=colour,
-            order="share:Q",
-        )
-    )
-    base = Chart.of_rows(f"{name}_medians").encode(x="value:Q", y="share:Q", color=colour)
-    drops = base.mark("rule", strokeDash=[2, 3], strokeWidth=1.2).encode(y2={"value": "height"})
-    dots = base.mark("point", size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
-    meta = {"gutter": GUTTER + 19}
-    chart = layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
-    parts = [f"{row['value']:.2f} m/s {INPUT_WORDS[row['series']]}" for row in medians.iter_rows(named=True)]
-    half = f"Share of the samples below each {what}. Half of them are below {', '.join(parts)}."
-    return Drawing(chart, {name: curves, f"{name}_medians": medians}, note, half)
-
-
-def list_events(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Start of each motion event: ``t kind x y``; empty without any."""
-    table = scene.report.tables.get("events")
-    if table is None or table.is_empty():
-        return {}
-    east, north = scene.origin
-    kind = pl.col("kind").cast(pl.String).str.replace_all("_", " ")
-    return {"events": table.select(t="t_start", kind=kind, x=pl.col("x") - east, y=pl.col("y") - north)}
-
-
-def format_events(events: pl.DataFrame) -> str:
-    """Number of events of each kind, and start of the first."""
-    counts = events.group_by("kind", maintain_order=True).agg(pl.len().alias("count"), pl.col("t").first())
-    sentences = []
-    for kind, count, first in counts.select("kind", "count", "t").iter_rows():
-        others = f" and {count - 1} more" if count > 1 else ""
-        sentences.append(f"{kind} at {first:.0f} s{others}")
-    return ", ".join(sentences)
+    words = f"Drawn from {drawn:,} of {total:,} points: {rule}, so no peak is lost."
+    return words if drawn < total else ""

@@ -1,34 +1,15 @@
-"""Figures of residuals: against signals, their own past, the input, and each effect."""
-
-from collections.abc import Callable
+"""Figures of residuals: over time, against signals, and of each effect."""
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import Floats
-from pipeline.estimation.effect_signature import (
-    FEWEST,
-    LONGEST_S,
-    SINCE_STEP,
-    VARIABLES,
-    Signature,
-    autocorrelate,
-    cross_correlate,
-)
+from pipeline.estimation.effect_signature import SINCE_STEP, VARIABLES, Signature
 from pipeline.report import figures, format_known_share, format_number, theme
-from pipeline.report.figures import Figure, Section
+from pipeline.report.figures import Figure
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
 from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series
-from pipeline.report.theme import (
-    Chart,
-    Drawing,
-    encode_column,
-    find_range,
-    layer,
-    make_axis,
-    stack,
-    usual_ends,
-)
+from pipeline.report.theme import Chart, Drawing, layer, make_axis, stack, usual_ends
 
 
 def draw_horizon_errors(scene: Scene) -> Drawing | None:
@@ -36,17 +17,18 @@ def draw_horizon_errors(scene: Scene) -> Drawing | None:
     motion = scene.report.motion
     if motion is None or motion.horizon_errors.is_empty():
         return None
-    rows = list_horizon_errors(scene)
-    ends = usual_ends(motion.horizon_errors["ideal"], exact=False)
-    shown = find_range(rows["reach"], (ends[0], ends[1]))
-    colour = figures.before_and_after(motion.input)
-    chart = figures.draw_lines(scene, ["reach"], shown, colour).properties(
+    errors, rows = motion.horizon_errors, list_horizon_errors(scene)
+    chart = figures.draw_lines(
+        ["reach"],
+        rows["reach"],
+        usual_ends(errors["ideal"], exact=False),
+        ("error of a 2 s prediction", "m"),
+        figures.before_and_after(motion.input),
+        x=figures.time_axis(scene),
         height=130,
-        title=figures.title_panel("error of a 2 s prediction", "m", shown),
-        usermeta=figures.brush_over_time(),
-    )
-    row = motion.horizon_errors.row(motion.horizon_errors["model"].arg_max() or 0, named=True)
-    medians = [float(motion.horizon_errors[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
+    ).properties(usermeta=figures.brush_over_time())
+    row = errors.row(errors["model"].arg_max() or 0, named=True)
+    medians = [float(np.median(errors[name].to_numpy())) for name in ("ideal", "model")]
     words = (
         f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
         f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
@@ -68,13 +50,7 @@ def list_horizon_errors(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 REACH = Figure(
-    "Predictions over two seconds",
-    Section.REST,
-    draw_horizon_errors,
-    order=6,
-    width="full",
-    live=list_horizon_errors,
-    id="reach",
+    "reach", "Predictions over two seconds", draw_horizon_errors, width="full", live=list_horizon_errors
 )
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("lateral", "m/s"), "w": ("yaw rate", "rad/s")}
@@ -94,11 +70,9 @@ def draw_residuals(scene: Scene) -> Drawing | None:
         return None
     rows = list_residuals(scene)
     panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
-    chart = stack(*panels).resolve_scale(x="independent", y="independent")
+    chart = stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
     note = "Lines: medians; bands: interquartile range. A line along zero means no dependence on that signal."
-    return Drawing(
-        chart.properties(usermeta={"gutter": figures.GUTTER}), rows, note, _format_residuals(motion)
-    )
+    return Drawing(chart, rows, note, _format_residuals(motion))
 
 
 def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -146,25 +120,14 @@ def _find_edges(signal: Floats) -> Floats:
 def _bin_residuals(motion: MotionView, component: str) -> pl.DataFrame:
     signal = motion.residuals[choose_signal(motion, component)].to_numpy()
     number = np.searchsorted(_find_edges(signal), signal, side="right")
-    rows = []
-    for series in ("ideal", "model"):
-        residual = motion.residuals[f"{series}_{component}"].to_numpy()
-        for each in np.unique(number):
-            inside = number == each
-            if inside.sum() < _FEWEST:
-                continue
-            low, middle, high = np.quantile(residual[inside], _QUARTILES).tolist()
-            rows.append(
-                {
-                    "value": float(np.median(signal[inside])),
-                    "low": low,
-                    "middle": middle,
-                    "high": high,
-                    "series": series,
-                }
-            )
+    rows = [
+        (float(np.median(signal[inside])), *np.quantile(residual[inside], _QUARTILES).tolist(), series)
+        for series in ("ideal", "model")
+        for residual in [motion.residuals[f"{series}_{component}"].to_numpy()]
+        for inside in (number == each for each in np.flatnonzero(np.bincount(number) >= _FEWEST))
+    ]
     schema = {**dict.fromkeys(("value", "low", "middle", "high"), pl.Float64), "series": pl.String}
-    return pl.DataFrame(rows, schema=schema)
+    return pl.DataFrame(rows, schema=schema, orient="row")
 
 
 def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Chart:
@@ -202,201 +165,19 @@ def _format_residuals(motion: MotionView) -> str:
 
 
 RESIDUALS = Figure(
-    "Residual against the signal that explains most of it",
-    Section.REST,
-    draw_residuals,
-    order=2,
-    live=list_residuals,
-    id="residuals",
-)
-
-Correlation = tuple[Floats, Floats, float]
-
-
-def draw_autocorrelation(scene: Scene) -> Drawing | None:
-    """Draw a panel per channel, before and after; None without a model or with too few windows."""
-    rows = list_autocorrelations(scene)
-    if not rows:
-        return None
-    titles = {component: f"{QUANTITIES[component][0]} residual" for component in COMPONENTS}
-    chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
-    note = "Grey: 95 % band of white noise. A curve outside of it for seconds shows unmodelled structure."
-    return Drawing(chart, rows, note, _format_autocorrelation(rows))
-
-
-def draw_correlations(scene: Scene, name: str, titles: dict[str, str], axis: tuple[float, str]) -> Chart:
-    """Draw a panel for each title, before and after, with the confidence bounds in grey.
-
-    Args:
-        scene: the run, with a model.
-        name: name of the rows, to which ``_`` and the channel are appended.
-        titles: titles of the panels, by channel.
-        axis: first lag [s], and title of the axis.
-    """
-    panels = []
-    motion = scene.report.motion
-    for component, title in titles.items():
-        last = component == list(titles)[-1]
-        lags = {"domain": [axis[0], LONGEST_S]}
-        x = encode_column(
-            "lag:Q", scale=lags, axis={"title": axis[1] if last else None, "labels": last, "grid": False}
-        )
-        ends, ticks = (-1.0 if axis[0] else -0.6, 1.0), [-0.5, 0, 0.5, 1]
-        y = make_axis("value", None, ends, values=ticks, minExtent=figures.GUTTER - 10)
-        base = Chart.of_rows(f"{name}_{component}")
-        colour = figures.before_and_after(motion.input if motion else "")
-        band = base.filter("datum.series === 'model'").mark("area", color=theme.SHADE, clip=True)
-        zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
-        line = base.mark("line", clip=True, strokeWidth=2).encode(x=x, y=y, color=colour)
-        drawn = layer(band.encode(x=x, y="low:Q", y2="high:Q"), zero, line)
-        panels.append(drawn.properties(width=480, height=96, title={"text": title}))
-    return stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
-
-
-def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """As `list_correlations`, for the autocorrelation of residuals."""
-    return list_correlations(scene, "autocorrelation", lambda _motion, _component: autocorrelate)
-
-
-def list_correlations(
-    scene: Scene, name: str, choose: Callable[[MotionView, str], Callable[[Floats, Floats], Correlation]]
-) -> dict[str, pl.DataFrame]:
-    """Rows ``lag value low high series`` of every channel; empty without a model or with too few windows.
-
-    Args:
-        scene: the run.
-        name: prefix of the row names, before the channel.
-        choose: function from run and channel to the correlation of residuals at times [s].
-    """
-    motion = scene.report.motion
-    if motion is None or motion.residuals.height < FEWEST:
-        return {}
-    t = motion.residuals["t"].to_numpy()
-    return {
-        f"{name}_{component}": _tabulate_correlations(
-            {
-                series: choose(motion, component)(t, motion.residuals[f"{series}_{component}"].to_numpy())
-                for series in ("ideal", "model")
-            }
-        )
-        for component in COMPONENTS
-    }
-
-
-def _tabulate_correlations(correlations: dict[str, Correlation]) -> pl.DataFrame:
-    """Lags, correlations and bounds by series as rows ``lag value low high series``."""
-    frames = [
-        pl.DataFrame({"lag": lags, "value": values}).with_columns(
-            low=pl.lit(-bound), high=pl.lit(bound), series=pl.lit(series)
-        )
-        for series, (lags, values, bound) in correlations.items()
-    ]
-    return pl.concat(frames)
-
-
-def _format_autocorrelation(rows: dict[str, pl.DataFrame]) -> str:
-    """The correlation at the lag nearest to one second, before and after, and the bound."""
-    parts, lag = [], 0.0
-    for name, frame in rows.items():
-        later = frame.filter(pl.col("lag") > 0.0)
-        if later.is_empty():
-            continue
-        lag = float(later["lag"][int((later["lag"] - 1.0).abs().arg_min() or 0)])
-        values = dict(later.filter(pl.col("lag") == lag).select("series", "value").iter_rows())
-        parts.append(f"{QUANTITIES[name[-1]][0]} {values['ideal']:.2f} before, {values['model']:.2f} after")
-    if not parts:
-        return ""
-    bound = float(next(iter(rows.values()))["high"][0])
-    return (
-        f"Autocorrelation of residuals {lag:.2g} s apart: {'; '.join(parts)}; noise stays below {bound:.2f}."
-    )
-
-
-AUTOCORRELATION = Figure(
-    "Autocorrelation of the residual",
-    Section.REST,
-    draw_autocorrelation,
-    order=4,
-    live=list_autocorrelations,
-    id="autocorrelation",
-)
-
-_WORDS = {"f_x": "speed", "f_y": "lateral speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
-
-
-def draw_crosscorrelation(scene: Scene) -> Drawing | None:
-    """Draw a panel per channel, before and after; None without a model or with too few windows."""
-    rows, motion = list_crosscorrelations(scene), scene.report.motion
-    if not rows or motion is None:
-        return None
-    inputs = choose_inputs(motion)
-    titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]}" for one in inputs}
-    axis = (-LONGEST_S, "lag of the residual behind the input [s]")
-    note = "Grey: 95 % band without correlation. Positive times: the input precedes the residual."
-    return Drawing(
-        draw_correlations(scene, "crosscorrelation", titles, axis),
-        rows,
-        note,
-        _format_crosscorrelation(rows),
-    )
-
-
-def choose_inputs(motion: MotionView) -> dict[str, str]:
-    """Input to correlate with each channel's residual; for the lateral one that of turning while driving."""
-    moves_aside = bool(motion.residuals["f_y"].abs().max() or 0.0)
-    return {"x": "f_x", "y": "f_y" if moves_aside else "f_x_f_w", "w": "f_w"}
-
-
-def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """As `list_correlations`, for the correlation of residuals with the input."""
-    return list_correlations(
-        scene,
-        "crosscorrelation",
-        lambda motion, component: (
-            lambda t, residual: cross_correlate(
-                t, motion.residuals[choose_inputs(motion)[component]].to_numpy(), residual
-            )
-        ),
-    )
-
-
-def _format_crosscorrelation(rows: dict[str, pl.DataFrame]) -> str:
-    """Largest correlation with the input, before and after."""
-    sentences = []
-    for name, frame in rows.items():
-        most = dict(frame.group_by("series").agg(pl.col("value").abs().max()).iter_rows())
-        bound = float(frame.filter(pl.col("series") == "model")["high"][0])
-        words = f"{most['ideal']:.2f} before, {most['model']:.2f} after, bound {bound:.2f}"
-        sentences.append(f"{QUANTITIES[name[-1]][0]} {words}")
-    return f"Largest correlation of residuals with the input within five seconds: {'; '.join(sentences)}."
-
-
-CROSSCORRELATION = Figure(
-    "Cross-correlation of the residual with the input",
-    Section.REST,
-    draw_crosscorrelation,
-    order=5,
-    id="crosscorrelation",
+    "residuals", "Residual against the signal that explains most of it", draw_residuals, live=list_residuals
 )
 
 _SERIES = {"before": "error without it", "after": "with it", "curve": "its effect"}
 
 
-def list_panels(scene: Scene) -> dict[str, Drawing]:
+def draw_signatures(scene: Scene) -> dict[str, Drawing]:
     """One panel per effect, by its id; empty without a model."""
     motion = scene.report.motion
     if motion is None:
         return {}
     colour = theme.INPUT_COLOURS.get(motion.input, theme.QUIET)
-    return {
-        one.effect: Drawing(
-            _draw_panel_of_signature(one, colour),
-            {_name_rows(one): _tabulate(one)},
-            _note(one),
-            _format_signature(one),
-        )
-        for one in motion.signatures
-    }
+    return {one.effect: _draw_signature(one, colour) for one in motion.signatures}
 
 
 def list_signatures(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -424,25 +205,15 @@ def _tabulate(signature: Signature) -> pl.DataFrame:
     )
 
 
-def _name_axes(signature: Signature) -> tuple[str, str]:
-    """Variable and residual, in words with units."""
+def _draw_signature(signature: Signature, colour: str) -> Drawing:
     what, unit = QUANTITIES[signature.channel]
-    variable, own_unit = VARIABLES[signature.variable]
-    error = (
-        f"{what} error, share of the step" if signature.variable == SINCE_STEP else f"{what} error [{unit}]"
-    )
-    return f"{variable} [{own_unit}]", error
-
-
-def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
-    variable, error = _name_axes(signature)
-    scale = {"domain": list(_SERIES), "range": [colour, theme.MODEL, theme.INK]}
-    label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _SERIES.items())
-    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "circle", "symbolSize": 60}
-    shade = encode_column("series:N", scale=scale, legend=legend)
-    wide = {"zero": False, "nice": False, "padding": 8}
-    x = make_axis("value", variable, scale=wide, tickCount=6, grid=False)
-    tall = {"nice": False, "padding": 12}
+    variable, variable_unit = VARIABLES[signature.variable]
+    share = signature.variable == SINCE_STEP
+    error = f"{what} error, share of the step" if share else f"{what} error [{unit}]"
+    colours = {"before": colour, "after": theme.MODEL, "curve": theme.INK}
+    shade = figures.series_colour(_SERIES, colours, "circle")
+    wide, tall = {"zero": False, "nice": False, "padding": 8}, {"nice": False, "padding": 12}
+    x = make_axis("value", f"{variable} [{variable_unit}]", scale=wide, tickCount=6, grid=False)
     y = make_axis("mean", None, scale=tall, tickCount=5, minExtent=figures.GUTTER - 10)
     base = Chart.of_rows(_name_rows(signature))
     zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
@@ -450,28 +221,19 @@ def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
     bars = measured.mark("rule", strokeWidth=1.2).encode(x=x, y="low:Q", y2="high:Q", color=shade)
     points = measured.mark("circle", size=42, opacity=1).encode(x=x, y=y, color=shade)
     curve = base.filter("datum.series === 'curve'").mark("line", strokeWidth=1.8, order=False)
-    return layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(
+    chart = layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(
         width=480, height=170, title={"text": error}, usermeta={"gutter": figures.GUTTER}
     )
-
-
-def _note(signature: Signature) -> str:
-    variable = VARIABLES[signature.variable][0]
-    return f"{format_known_share(signature.explained)} of its effect is a function of the {variable}."
-
-
-def _format_signature(signature: Signature) -> str:
-    variable, error = _name_axes(signature)
-    sizes = [
+    before, after = (
         format_number(float(np.sqrt(np.mean(values**2)))) for values in (signature.before, signature.after)
-    ]
-    return (
-        f"{error} against {variable}, in {signature.value.size} bins: root mean square {sizes[0]} without "
-        f"{signature.effect}, {sizes[1]} with it."
+    )
+    return Drawing(
+        chart,
+        {_name_rows(signature): _tabulate(signature)},
+        f"{format_known_share(signature.explained)} of its effect is a function of the {variable}.",
+        f"{error} against {variable} [{variable_unit}], in {signature.value.size} bins: root mean square "
+        f"{before} without {signature.effect}, {after} with it.",
     )
 
 
-_TITLE = "Each effect: model and measurement"
-SIGNATURE = Figure(
-    _TITLE, Section.EFFECT, None, order=0, panels=list_panels, live=list_signatures, id="signature"
-)
+SIGNATURE = Figure("signature", "Each effect: model and measurement", draw_signatures, live=list_signatures)

@@ -1,23 +1,16 @@
-"""Figures of slip: over the path, the commands and time, its distributions; steps of commands."""
+"""Figures of slip: over the path, the commands and time; steps of commands."""
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, Floats, format_length, format_share
 from pipeline.report import figures, format_number, theme
-from pipeline.report.figures import Figure, Section, draw_shares, format_events, list_events
-from pipeline.report.scene import Scene, break_lines, thin_to_peaks
+from pipeline.report.figures import Figure
+from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import (
-    MAP_HIGHEST,
-    MAP_LOWEST,
-    MAP_WIDTH,
-    Channel,
     Chart,
     Drawing,
     encode_column,
-    find_extent,
-    find_range,
-    fit_equal_aspect,
     layer,
     make_axis,
     round_up,
@@ -31,46 +24,41 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     if track is None:
         return None
     frame = track.frame
-    extent = [find_extent(frame["x"]), find_extent(frame["y"])]
-    height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
-    x = _make_axis("x", scene.origin[0], x_domain)
-    y = _make_axis("y", scene.origin[1], y_domain)
-    base = Chart.of_rows("track")
+    x, y, properties = figures.make_map(frame, scene.origin, (260, 420))
+    at = {"x": "x:Q", "y": "y:Q"}
     line = Chart.of_rows("path").mark("line", color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False)
-    path = line.encode(x=x, y=y)
     tooltip = [
         encode_column("t:Q", title="time [s]", format=".2f"),
         encode_column("modulus:Q", title="slip modulus [m/s]", format=".2f"),
     ]
-    dots = base.mark("circle", size=16, opacity=1).encode(
-        x="x:Q", y="y:Q", color=figures.slip_colour(scene), tooltip=tooltip
-    )
-    marked = (
-        Chart.of_rows(figures.MARKED_POINTS)
-        .mark("circle", size=52, opacity=0.9, color=theme.MARK)
-        .encode(x="x:Q", y="y:Q")
-    )
-    ends = Chart.of_rows("track_ends").encode(x="x:Q", y="y:Q")
+    dots = Chart.of_rows("track").mark("circle", size=16, opacity=1)
+    dots = dots.encode(**at, color=figures.slip_colour(scene), tooltip=tooltip)
+    marked = Chart.of_rows(figures.MARKED_POINTS).mark("circle", size=52, opacity=0.9, color=theme.MARK)
+    charts, rows = [line.encode(x=x, y=y), marked.encode(**at), dots], list_arcs(scene)
+    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile."
+    if rows:
+        arcs = Chart.of_rows("arcs").mark(
+            "line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False, clip=True
+        )
+        charts.append(arcs.encode(**at))
+        note += " Lines: where the model goes in two seconds from measured poses."
+    events = list_events(scene)
+    if events is not None:
+        triangle = Chart.of_rows("events").mark(
+            "point", shape="triangle-up", size=90, filled=True, opacity=1, color=theme.MARK
+        )
+        what = [
+            encode_column("kind:N", title="event"),
+            encode_column("t:Q", title="time [s]", format=".1f"),
+        ]
+        charts.append(triangle.encode(**at, tooltip=what))
+        rows["events"] = events
+        note += f" Triangles: {format_events(events)}."
+    ends = Chart.of_rows("track_ends").encode(**at)
+    places = {"domain": ["start", "end"], "range": ["circle", "square"]}
     spots = ends.mark(
         "point", size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1
-    ).encode(
-        shape=encode_column(
-            "place:N", scale={"domain": ["start", "end"], "range": ["circle", "square"]}, legend=None
-        )
-    )
-    happened = list_events(scene)
-    events = [
-        Chart.of_rows("events")
-        .mark("point", shape="triangle-up", size=90, filled=True, opacity=1, color=theme.MARK)
-        .encode(
-            x="x:Q",
-            y="y:Q",
-            tooltip=[
-                encode_column("kind:N", title="event"),
-                encode_column("t:Q", title="time [s]", format=".1f"),
-            ],
-        )
-    ]
+    ).encode(shape=encode_column("place:N", scale=places, legend=None))
     # Above and below, so that both are legible if a run ends where it began.
     words = [
         ends.filter(f"datum.place === '{end}'")
@@ -78,35 +66,37 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         .encode(text="place:N")
         for end, dy in (("start", -9), ("end", 12))
     ]
-    meta = figures.brush_over_plane("x", "y") | {
-        "dots": {"track": "measured"},
-        "equal": {"x": extent[0], "y": extent[1], "lowest": MAP_LOWEST, "highest": MAP_HIGHEST},
+    properties["usermeta"] |= figures.brush_over_plane("x", "y") | {"dots": {"track": "measured"}}
+    chart = layer(*charts, spots, *words).properties(**properties)
+    rows |= {
+        "track": frame,
+        "path": break_lines(frame.select("x", "y", "piece"), "x", "y"),
+        "track_ends": pl.concat([frame.head(1), frame.tail(1)]).with_columns(
+            place=pl.Series(["start", "end"])
+        ),
+        figures.MARKED_POINTS: figures.EMPTY_POINTS,
     }
-    predicted = [
-        Chart.of_rows("arcs")
-        .mark("line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False, clip=True)
-        .encode(x="x:Q", y="y:Q")
-    ]
-    above = [*(predicted if scene.report.motion else []), *(events if happened else [])]
-    chart = layer(path, marked, dots, *above, spots, *words).properties(
-        width=MAP_WIDTH, height=height, usermeta=meta
+    note += f" {figures.format_thinning(track, rule='the highest slip of every bin')}"
+    return Drawing(chart, rows, note.strip(), format_map(scene))
+
+
+def list_events(scene: Scene) -> pl.DataFrame | None:
+    """Start of each motion event: ``t kind x y``; None without any."""
+    table = scene.report.table("events")
+    if table is None:
+        return None
+    east, north = scene.origin
+    kind = pl.col("kind").cast(pl.String).str.replace_all("_", " ")
+    return table.select(t="t_start", kind=kind, x=pl.col("x") - east, y=pl.col("y") - north)
+
+
+def format_events(events: pl.DataFrame) -> str:
+    """Number of events of each kind, and start of the first."""
+    counts = events.group_by("kind", maintain_order=True).agg(pl.len().alias("count"), pl.col("t").first())
+    return ", ".join(
+        f"{kind} at {first:.0f} s{f' and {count - 1} more' if count > 1 else ''}"
+        for kind, count, first in counts.select("kind", "count", "t").iter_rows()
     )
-    first, last = (
-        frame.head(1).with_columns(place=pl.lit("start")),
-        frame.tail(1).with_columns(place=pl.lit("end")),
-    )
-    steps = break_lines(frame.select("x", "y", "piece"), "x", "y")
-    rows = (
-        list_arcs(scene)
-        | happened
-        | {"track": frame, "path": steps, "track_ends": pl.concat([first, last])}
-        | figures.marked_rows()
-    )
-    note = figures.format_thinning(track, rule="the highest slip of every bin")
-    arcs = " Lines: where the model goes in two seconds from measured poses." if scene.report.motion else ""
-    sentence = f" Triangles: {format_events(happened['events'])}." if happened else ""
-    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs}{sentence} {note}".strip()
-    return Drawing(chart, rows, note, format_map(scene))
 
 
 def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -119,12 +109,6 @@ def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
     shown = motion.arcs.filter(pl.col("piece") % 2 == 0)
     moved = shown.with_columns(pl.col("x") - east, pl.col("y") - north)
     return {"arcs": break_lines(moved, "x", "y")}
-
-
-def _make_axis(name: str, offset: float, domain: list[float]) -> Channel:
-    less = f", less {offset:,.0f} m" if offset else ""
-    title, scale = f"{name} in the map{less} [m]", {"domain": domain, "nice": False, "zero": False}
-    return make_axis(name, title, scale=scale, tickCount=5, minExtent=figures.GUTTER - 20)
 
 
 def format_map(scene: Scene) -> str:
@@ -143,7 +127,7 @@ def format_map(scene: Scene) -> str:
     )
 
 
-TRAJECTORY = Figure("On the map", Section.WHERE, draw_trajectory, order=10, live=list_arcs, id="trajectory")
+TRAJECTORY = Figure("trajectory", "On the map", draw_trajectory, live=list_arcs)
 
 _CELLS = 20
 _FEWEST_SAMPLES = 3
@@ -181,13 +165,32 @@ def draw_command_space(scene: Scene) -> Drawing | None:
     meta = figures.brush_over_plane("f_w", "f_x")
     chart = layer(heat, marked).properties(width=480, height=340, usermeta=meta)
     note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
-    return Drawing(chart, list_cells(scene) | figures.marked_rows(), note, format_cells(scene))
+    rows = list_cells(scene) | {figures.MARKED_POINTS: figures.EMPTY_POINTS}
+    return Drawing(chart, rows, note, format_cells(scene))
 
 
 def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Cells of the plane of commands: edges, median slip modulus, samples; empty without slip."""
+    """Cells of equal size over the plane of commands: edges, median slip modulus, samples.
+
+    Empty without slip.
+    """
     slip = scene.sound_slip.get(scene.report.main_input)
-    return {} if slip is None else {"command_cells": _count_cells(slip)}
+    if slip is None:
+        return {}
+    edges = {}
+    for name, short in (("f_x", "x"), ("f_w", "w")):
+        low, high = _bound(slip, name)
+        size = (high - low) / _CELLS
+        number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
+        edges[f"{short}_low"] = low + number * size
+        edges[f"{short}_high"] = low + (number + 1) * size
+    grid = (
+        slip.select("modulus", **edges)
+        .group_by(*edges)
+        .agg(modulus=pl.col("modulus").median(), samples=pl.len())
+        .filter(pl.col("samples") >= _FEWEST_SAMPLES)
+    )
+    return {"command_cells": grid.sort(*edges)}
 
 
 def _bound(slip: pl.DataFrame, name: str) -> list[float]:
@@ -196,27 +199,6 @@ def _bound(slip: pl.DataFrame, name: str) -> list[float]:
         -round_up(-low) if low < -_SMALLEST_BOUND else -_SMALLEST_BOUND,
         round_up(high) if high > _SMALLEST_BOUND else _SMALLEST_BOUND,
     ]
-
-
-def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
-    """Cells of equal size over the plane of commands: edges, median slip modulus, samples."""
-    columns = []
-    for name, short in (("f_x", "x"), ("f_w", "w")):
-        low, high = _bound(slip, name)
-        size = (high - low) / _CELLS
-        number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
-        columns += [
-            (low + number * size).alias(f"{short}_low"),
-            (low + (number + 1) * size).alias(f"{short}_high"),
-        ]
-    edges = ["x_low", "x_high", "w_low", "w_high"]
-    return (
-        slip.select(*columns, "modulus")
-        .group_by(edges)
-        .agg(modulus=pl.col("modulus").median(), samples=pl.len())
-        .filter(pl.col("samples") >= _FEWEST_SAMPLES)
-        .sort(edges)
-    )
 
 
 def format_cells(scene: Scene) -> str:
@@ -232,27 +214,34 @@ def format_cells(scene: Scene) -> str:
     )
 
 
-COMMAND_SPACE = Figure(
-    "Over the commands", Section.WHERE, draw_command_space, order=20, live=list_cells, id="command_space"
-)
+COMMAND_SPACE = Figure("command_space", "Over the commands", draw_command_space, live=list_cells)
 
 
 def draw_modulus(scene: Scene) -> Drawing | None:
-    """Draw one line per input; gaps are open, stretches after a change of command shaded."""
-    lines = scene.modulus_lines
+    """Draw one line per input over the whole run, in which the enlarged stretch is marked."""
+    lines, span = scene.modulus_lines, scene.worst_span
     if lines is None:
         return None
-    shown = find_range(lines.frame, lines.usual)
-    residual = [] if scene.main_residual is None else ["model"]
-    colour = figures.series_colour([*scene.slip, *residual], {**INPUT_WORDS, "model": "with the model"})
-    chart = figures.draw_lines(scene, ["modulus"], shown, colour).properties(
-        height=150,
-        title=figures.title_panel("slip modulus", "m/s", shown),
-        usermeta=figures.brush_over_time(),
-    )
-    note = figures.format_thinning(lines, rule="first, last, lowest and highest of every bin")
+    residual = {} if scene.main_residual is None else {"model": "with the model"}
+    colour = figures.series_colour({name: INPUT_WORDS[name] for name in scene.slip} | residual)
     rows = {"modulus": lines.frame} | figures.span_rows(scene)
-    return Drawing(chart, rows, f"{figures.format_bands(scene)} {note}".strip(), _format_slip(scene))
+    note, meta = figures.format_bands(scene, lines), figures.brush_over_time()
+    if span is not None:
+        rows[figures.SHOWN_SPAN] = pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]})
+        meta["brush"] = "zoom"
+        length = span[1] - span[0]
+        note = f"Enlarged below: the {length:g} s with the most slip. Drag here to draw others. {note}"
+    chart = figures.draw_lines(
+        ["modulus"],
+        lines.frame,
+        lines.usual,
+        ("slip modulus", "m/s"),
+        colour,
+        x=figures.time_axis(scene),
+        height=120,
+        bands=figures.shade_spans(*(name for name in rows if name != "modulus")),
+    )
+    return Drawing(chart.properties(usermeta=meta), rows, note.strip(), _format_slip(scene))
 
 
 def _format_slip(scene: Scene) -> str:
@@ -267,82 +256,14 @@ def _format_slip(scene: Scene) -> str:
     if scene.main_residual is not None:
         median = scene.main_residual.filter(~pl.col("suspect"))["residual_modulus"].median()
         sentences.append(f"the model leaves a median of {format_number(median)} m/s")  # type: ignore[arg-type]
-    return "Slip modulus over time: " + "; ".join(sentences) + "."
+    text = "Slip modulus over time: " + "; ".join(sentences) + "."
+    if scene.worst_span is None:
+        return text
+    start, end = scene.worst_span
+    return f"{text} The next figure draws {start:.0f} s to {end:.0f} s large; arrow keys move the stretch."
 
 
-MODULUS = Figure("Slip over time", Section.HOW_BAD, draw_modulus, order=10, width="full", id="modulus")
-
-_BINS = 600
-
-
-def draw_navigator(scene: Scene) -> Drawing | None:
-    """Draw slip modulus over the whole run, and the visible stretch; None for a short run."""
-    slip, span = scene.main_slip, scene.worst_span
-    if slip is None or span is None:
-        return None
-    peaks = thin_to_peaks(slip.select("t", "piece", "modulus"), "modulus", bins=_BINS)
-    x = figures.time_axis(scene)
-    y = encode_column("modulus:Q", scale={"domain": [0.0, scene.modulus_cap], "nice": False}, axis=None)
-    area = Chart.of_rows("navigator").mark("area", color=theme.CROSS, opacity=0.6, clip=True, order=False)
-    window = Chart.of_rows(figures.SHOWN_SPAN).mark("rect", color=theme.MARK, opacity=0.35)
-    chart = layer(area.encode(x=x, y=y), window.encode(x="t_start:Q", x2="t_end:Q")).properties(
-        width=figures.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4}
-    )
-    rows = {
-        "navigator": break_lines(peaks, "modulus"),
-        figures.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),
-    }
-    length = span[1] - span[0]
-    note = f"Enlarged below: the {length:g} s with the most slip. Drag over the strip to draw others."
-    words = (
-        f"Slip modulus {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
-        f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
-        "arrow keys move the stretch."
-    )
-    return Drawing(chart, rows, note, words)
-
-
-NAVIGATOR = Figure("The whole run", Section.WHERE, draw_navigator, order=29, width="full", id="navigator")
-
-
-def draw_distribution(scene: Scene) -> Drawing | None:
-    """Draw the share of time steps below each modulus."""
-    if not scene.sound_slip:
-        return None
-    values = {name: frame["modulus"] for name, frame in scene.sound_slip.items()}
-    return draw_shares("modulus_shares", values, "slip modulus", of=" of a time step")
-
-
-DISTRIBUTION = Figure(
-    "Distribution over time steps", Section.HOW_BAD, draw_distribution, order=20, id="distribution"
-)
-
-
-def draw_window_norms(scene: Scene) -> Drawing | None:
-    """Draw the share of windows below each norm."""
-    norms = _list_norms(scene)
-    if not norms:
-        return None
-    note = "The norm of the published figure: \u221a40 \u00d7 root mean square slip modulus over 2 s."
-    return draw_shares("norm_shares", norms, "2 s window norm", note=note)
-
-
-def _list_norms(scene: Scene) -> dict[str, pl.Series]:
-    windows = scene.report.table("windows")
-    if windows is None:
-        return {}
-    if "suspect" in windows.columns:
-        windows = windows.filter(~pl.col("suspect"))
-    by_input = {
-        name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"]
-        for name in scene.report.inputs
-    }
-    return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
-
-
-WINDOW_NORMS = Figure(
-    "Distribution over 2 s windows", Section.HOW_BAD, draw_window_norms, order=30, id="window_norms"
-)
+MODULUS = Figure("modulus", "Slip over time", draw_modulus, width="full")
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0
@@ -426,10 +347,10 @@ def _draw_response(component: str, series: list[str]) -> Chart:
     look = {"title": "time since the step [s]" if last else None, "labels": last, "grid": False}
     x = encode_column("t:Q", scale={"domain": [-_BEFORE_S, _AFTER_S], "nice": False}, axis=look)
     y = make_axis("value", None, (-0.25, 1.4), values=[0, 0.5, 1], minExtent=figures.GUTTER - 10)
+    colour = figures.series_colour({name: _WORDS[name] for name in series})
     line = Chart.of_rows(f"response_{component}").mark("line", clip=True, strokeWidth=2)
-    drawn = line.encode(x=x, y=y, color=figures.series_colour(series, _WORDS))
     title = {"text": f"{_CHANNELS[component][0]}, share of the step"}
-    return layer(drawn).properties(width=480, height=96, title=title)
+    return line.encode(x=x, y=y, color=colour).properties(width=480, height=96, title=title)
 
 
 def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
@@ -445,10 +366,5 @@ def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
 
 
 STEP_RESPONSE = Figure(
-    "After a step of the command",
-    Section.REST,
-    draw_step_response,
-    order=3,
-    live=list_responses,
-    id="step_response",
+    "step_response", "After a step of the command", draw_step_response, live=list_responses
 )
