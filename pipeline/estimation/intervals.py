@@ -210,7 +210,7 @@ def _find_width(fit: PathFit, number: Free) -> float:
 def carry_clocks(fit: PathFit, information: Floats) -> Floats:
     """Variance of each number by clocks that the fit takes as given, shape (p,)."""
     path, carried = fit.path, np.zeros(len(fit.free))
-    for run, error in enumerate(path.list_clock_errors().tolist()):
+    for run, error in enumerate(path.list_clock_errors(fit.state).tolist()):
         if error == 0.0:
             continue
         mine, change = path.run == run, np.zeros((*fit.residual.shape, 1))

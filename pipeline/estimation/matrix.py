@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.estimation.candidates import PRICE, find_rarity, list_all_trials
 from pipeline.estimation.fit import invert, whiten_columns
 from pipeline.estimation.model_state import stack_columns
+from pipeline.models import Late
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -178,7 +179,7 @@ class Matrix:
 
     def _price(self, change: Change) -> float:
         stay = [effect for effect in self.fit.state.effects if effect.id not in change.gone]
-        ids = {"", *(effect.id for effect in stay)}
+        ids = {*(effect.id for effect in stay)} | (set() if self._is_delayed(change) else {""})
         numbers = sum(number.effect in ids for number in self.fit.free)
         own = PRICE * numbers + sum(map(find_rarity, stay))
         return own + sum(self.trials[index].price for index in change.added)
@@ -194,9 +195,15 @@ class Matrix:
         return self.measure(change) - self.measure(Change())
 
     def _list_columns(self, change: Change) -> Ints:
-        ids = ["", *(name for name in self.fit.ids if name not in change.gone)]
+        ids = [name for name in self.fit.ids if name not in change.gone]
+        ids += [] if self._is_delayed(change) else [""]
         own = [self._first + index for name in ids for index in self._own.get(name, ())]
         return np.array([*own, *(c for i in change.added for c in self._moved[i].tolist())], dtype=np.int64)
+
+    def _is_delayed(self, change: Change) -> bool:
+        """Whether a delay of the commands comes that takes over those of the encoders."""
+        late = (self.trials[index].effect.late for index in change.added)
+        return self.fit.path.reads_late and Late.COMMANDS in late
 
     def _aim(self, change: Change) -> Floats:
         """What the columns of a set must explain: the residual with what goes taken out, shape (q,)."""
@@ -221,7 +228,7 @@ class Matrix:
         size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
         normal, pull = normal / np.outer(size, size) + _RIDGE * np.eye(size.size), pulled[columns] / size
         inverse = np.linalg.inv(normal)
-        new = sum(self._moved[index].size for index in change.added)
+        new = self._count_new(change)
         if new and (1.0 / np.diag(inverse)[-new:]).min() < _INDEPENDENT:
             return math.inf, np.zeros(0)
         scaled = self._hold(normal, pull, inverse @ pull, columns, size)
@@ -255,9 +262,12 @@ class Matrix:
                 moved[free] = np.linalg.solve(normal[np.ix_(free, free)], rest)
         return np.clip(moved, low, high) if held.any() else moved
 
+    def _count_new(self, change: Change) -> int:
+        return sum(self._moved[index].size for index in change.added)
+
     def _split(self, step: Floats, change: Change) -> Iterator[tuple[float, ...]]:
         """The part of a step of each trial."""
-        begin = step.size - sum(self._moved[index].size for index in change.added)
+        begin = step.size - self._count_new(change)
         for index in change.added:
             end = begin + self._moved[index].size
             yield tuple(step[begin:end].tolist())
@@ -267,7 +277,7 @@ class Matrix:
         """The set at its expected values; where a number acts by a secant, also at the whole and at half."""
         step = self._solve(change)[1]
         state = self.fit.state.drop(change.gone) if change.gone else self.fit.state
-        own = self._list_columns(Change(change.gone)) - self._first
+        own = self._list_columns(change)[: step.size - self._count_new(change)] - self._first
         state = state.move([self.fit.free[index] for index in own.tolist()], step[: own.size].tolist())
         shares: list[dict[str, float]] = [{}, {}, {}]
         for index, mine in zip(change.added, self._split(step, change), strict=True):
@@ -358,8 +368,8 @@ class Matrix:
         for name in stay:
             yield now.drop(name)
             yield from (self.add(index, to=now.drop(name)) for index in new)
-        for pair in combinations(stay, 2):
-            yield from (self.add(index, to=now.drop(*pair)) for index in new)
+        for two in combinations(stay, 2):
+            yield from (self.add(index, to=now.drop(*two)) for index in new)
         for pair in combinations(self._leading[:_PAIRED], 2):
             if not have & {ids[index] for index in pair}:
                 yield self.add(*pair, to=now)

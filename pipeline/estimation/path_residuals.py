@@ -24,7 +24,7 @@ from pipeline.estimation.model_state import (
 from pipeline.estimation.noise import Steps, learn_noise
 from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import average_windows, locate_windows, number_stretches
-from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_late_effect
+from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_late, find_late_effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -82,6 +82,7 @@ class PathResiduals(ABC):
         prior: of the parameters.
         weight: of each step in a fit, shape (n, 1); one number where all runs count alike.
         dates_poses: whether its fixed clocks are those of the poses.
+        reads_late: whether its delays are those of encoders against the commands.
         clocks: ids of effects that are a clock of each single run.
         grounds: numbers of the runs on each ground; one empty group where all are on one.
         title: name of the path.
@@ -91,6 +92,7 @@ class PathResiduals(ABC):
     weight: Floats | float = 1.0
     dates_poses: bool = True
     is_delayed: bool = True
+    reads_late: bool = False
     channels: tuple[int, ...] = (0, 1, 2)
     title: str
 
@@ -152,7 +154,7 @@ class PathResiduals(ABC):
         return residuals[0] if len(residuals) == 1 else np.concatenate(residuals)
 
     @abstractmethod
-    def list_clock_errors(self) -> Floats:
+    def list_clock_errors(self, state: ModelState) -> Floats:
         """Standard error of each run's clock beside what a fit finds of it [s], shape (runs,)."""
 
     @abstractmethod
@@ -304,7 +306,7 @@ class BodyResiduals(PathResiduals):
         """See `PathResiduals`."""
         return self.residuals_by_run[run].find_residuals(state.effects_of(run), state.timing[run])
 
-    def list_clock_errors(self) -> Floats:
+    def list_clock_errors(self, state: ModelState) -> Floats:  # noqa: ARG002 - poses are late in any state
         """See `PathResiduals`: the poses relative to the gyro, or to encoders that are read periodically."""
         return np.array([self._find_clock_error(run_residuals) for run_residuals in self.residuals_by_run])
 
@@ -350,6 +352,7 @@ class WheelResiduals(PathResiduals):
     title = "Drivetrain effects"
     dates_poses = False
     is_delayed = False
+    reads_late = True
 
     def __init__(
         self,
@@ -363,16 +366,23 @@ class WheelResiduals(PathResiduals):
         self._exceeded = exceeded
         self.channels = (0, 1, 2) if sideways else (0, 2)
         self.measured = tuple(measured)
-        self._seen: dict[tuple[int, float], Floats] = {}
         self._spans = [locate_windows(run_residuals) for run_residuals in self.residuals_by_run]
+        self._seen = [
+            average_windows(one, wheels.predict_velocity((), _NO_DELAY), spans)
+            for one, wheels, spans in zip(self.residuals_by_run, measured, self._spans, strict=True)
+        ]
 
     def owns(self, effect: Effect) -> bool:
         """Effects on commands and in the drivetrain."""
         return effect.place <= Place.DRIVE
 
     def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
-        """See `PathResiduals`; limits are at least what the measured wheels exceed."""
-        return tuple(self._bound(state, number) for number in super().list_free(state, per_run))
+        """See `PathResiduals`; limits are at least what the measured wheels exceed.
+
+        A delay of the commands is that of the encoders, too: both are one number.
+        """
+        free = super().list_free(state, per_run)
+        return tuple(self._bound(state, one) for one in free if one.effect or not _is_delayed(state))
 
     def _bound(self, state: ModelState, number: Free) -> Free:
         if not number.effect:
@@ -385,35 +395,42 @@ class WheelResiduals(PathResiduals):
         return replace(number, bounds=(least, high)) if least < high else number
 
     def find_velocities(self, state: ModelState, run: int) -> Floats:
-        """See `PathResiduals`; in terms of the ideal velocity of the wheels."""
-        run_residuals, late = self.residuals_by_run[run], state.timing[run].encoder_delay_s
-        if (run, late) not in self._seen:
-            wheels = self.measured[run].predict_velocity((), Timing(late))
-            self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
-            self._seen[run, late] = average_windows(run_residuals, wheels, self._spans[run])
+        """See `PathResiduals`; in terms of the ideal velocity of the wheels.
+
+        The model is delayed, not the measured wheels: the same readings are compared at every delay.
+        """
+        run_residuals = self.residuals_by_run[run]
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        driven = run_residuals.predict_wheels(drive, _NO_DELAY)
-        apart: Floats = self._seen[run, late] - average_windows(run_residuals, driven, self._spans[run])
+        late = 0.0 if _is_delayed(state) else state.timing[run].encoder_delay_s
+        spans = self._spans[run] if late == 0.0 else locate_windows(run_residuals, late)
+        driven = average_windows(run_residuals, run_residuals.predict_wheels(drive, _NO_DELAY), spans)
+        apart: Floats = self._seen[run] - driven
         return apart
 
-    def list_clock_errors(self) -> Floats:
-        """See `PathResiduals`: when within a cell an encoder was read is not known."""
+    def list_clock_errors(self, state: ModelState) -> Floats:
+        """See `PathResiduals`: when within a cell, or a period, an encoder was read is not known."""
+        if _is_delayed(state):
+            return np.array([one.run.wheel_period_s for one in self.residuals_by_run]) / _UNIFORM
         return np.array([_WITHIN_CELL * one.grid.step_s for one in self.residuals_by_run])
 
     def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
         """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
-        timing = list(state.timing)
-        timing[run] = replace(timing[run], encoder_delay_s=timing[run].encoder_delay_s + late_s)
-        return self.find_run_residuals(replace(state, timing=tuple(timing)), run)
+        run_residuals = self.residuals_by_run[run]
+        drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
+        late = late_s if _is_delayed(state) else late_s + state.timing[run].encoder_delay_s
+        driven = run_residuals.predict_wheels(drive, _NO_DELAY)
+        moved = average_windows(run_residuals, driven, locate_windows(run_residuals, late))
+        return self._multiply(self._seen[run] - moved, run)
 
-    def list_rolled(self, state: ModelState) -> tuple[Floats, float]:
+    def list_rolled(self, state: ModelState) -> tuple[Floats, float]:  # noqa: ARG002 - wheels are as they are
         """See `PathResiduals`: the measured wheels, which body commands are compared with."""
-        seen = [
-            one.predict_velocity((), Timing(state.timing[run].encoder_delay_s))
-            for run, one in enumerate(self.measured)
-        ]
+        seen = [one.predict_velocity((), _NO_DELAY) for one in self.measured]
         is_body = all(one.run.alignment.body_multiplier is not None for one in self.residuals_by_run)
         return self._average(seen), 1.0 if is_body else 0.0
+
+
+def _is_delayed(state: ModelState) -> bool:
+    return find_late(state.effects, Late.COMMANDS) is not None
 
 
 def _group_by_ground(residuals_by_run: Sequence[RunResiduals]) -> tuple[tuple[int, ...], ...]:

@@ -59,6 +59,7 @@ class Late(enum.Enum):
 
     POSES = "poses are stamped late"
     HEADING = "the heading is older than its position"
+    COMMANDS = "the wheels follow their commands late, of which a delay of the encoders is a part"
     BODY = "the body follows its wheels late, which hides a delay of the encoders"
 
 
