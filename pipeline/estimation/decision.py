@@ -597,11 +597,14 @@ def drop_linearly(fit: PathFit, name: str) -> PathFit:
     smooth = [index for index, number in enumerate(free) if number.is_smooth]
     if smooth:
         moving = pick_columns(columns, smooth)
+        low, high = np.array([state.find_room(free[index]) for index in smooth]).T
+        left, moved = residual, np.zeros(len(smooth))
         for _ in range(3):
             # Outliers are others without the effect.
             white = whiten(path, fit.noise, residual, moving)
             step = invert(white.columns.T @ white.columns) @ (white.columns.T @ white.residual)
-            residual = residual - combine_columns(moving, step)
+            moved = np.clip(moved + step, low, high)
+            residual = left - combine_columns(moving, moved)
     return PathFit(path, state, free, residual, columns, fit.noise)
 
 

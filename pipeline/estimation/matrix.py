@@ -153,14 +153,7 @@ class Matrix:
         """Least and largest step of each column's number, infinite where none is known, shape (2, q)."""
         low, high = np.full(self._gram.shape[0], -math.inf), np.full(self._gram.shape[0], math.inf)
         for index, number in enumerate(self.fit.free):
-            value, (least, most) = self.fit.state.get(number), number.bounds
-            if math.isinf(self.fit.state.neutral_of(number)):
-                # A limit acts by its inverse, which is what is linear.
-                below = value - value**2 / least if least > 0.0 else -math.inf
-                above = min(0.999 * value, value - value**2 / most if most > value else math.inf)
-            else:
-                below, above = min(least - value, 0.0), max(most - value, 0.0)
-            low[self._first + index], high[self._first + index] = below, above
+            low[self._first + index], high[self._first + index] = self.fit.state.find_room(number)
         for trial, places in zip(self.trials, self._places, strict=True):
             for name, place in zip(trial.names, places.tolist(), strict=False):
                 parameter, value = trial.effect.parameter(name), trial.effect.values[name]

@@ -259,6 +259,15 @@ class ModelState:
         effect = self.find(free.effect)
         return 0.0 if effect is None else effect.parameter(free.name).neutral
 
+    def find_room(self, free: Free) -> tuple[float, float]:
+        """Least and largest step of a number, as `move` takes it, that keeps it within its bounds."""
+        value, (least, most) = self.get(free), free.bounds
+        if not math.isinf(self.neutral_of(free)):
+            return min(least - value, 0.0), max(most - value, 0.0)
+        # A limit acts by its inverse, which is what is linear.
+        low = value - value**2 / least if least > 0.0 else -math.inf
+        return low, min((1.0 - _LEAST_INVERSE) * value, value - value**2 / most if most > value else math.inf)
+
     def set(self, free: Free, value: float) -> ModelState:
         """The state with another value of a free number, held to its bounds."""
         value = free.hold(value)
