@@ -275,6 +275,7 @@ def test_motion_that_lasts_is_unexplained_and_its_own_past_predicts_it(tmp_path:
     assert run.noise_floor.velocity_rms[2] < 0.7 * run.ladder[-1].velocity_rms[2]
 
 
+@pytest.mark.long
 def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
