@@ -242,6 +242,7 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     assert "would remain over 2 s" in describe([run])
 
 
+@pytest.mark.long
 def test_a_wheel_out_of_round_is_told_by_what_it_has_turned(tmp_path: Path) -> None:
     def wobble(state: State) -> tuple[float, float, float]:
         missed = 0.06 * math.sin(state.right_angle) * _SCENE.vehicle.wheel_radius_m * state.right_speed

@@ -154,6 +154,7 @@ def test_a_lag_behind_a_limit_is_no_torque_limit(tmp_path: Path) -> None:
     assert {effect.id for effect in told.effects} == {*hidden}
 
 
+@pytest.mark.long
 def test_a_load_taken_on_halfway_is_a_change(tmp_path: Path) -> None:
     """Seven percent less travel from a moment on, beyond any doubt, was too small for a name."""
     scenario = Scenario(
