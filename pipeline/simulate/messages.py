@@ -272,11 +272,11 @@ def joints(
         source: of their motion.
         each: whether wheels of a side differ, as on a vehicle that moves sideways.
     """
-    named = {place: place if each else place.rsplit("_", 1)[-1] for place in places}
-    steers = [place.startswith("steer") for place in places]
+    named = {corner: corner if each else corner.rsplit("_", 1)[-1] for corner in places}
+    steers = [corner.startswith("steer") for corner in places]
     turned = tuple(Q("steering" if s else f"{named[p]}_angle") for p, s in zip(places, steers, strict=True))
     rolling = tuple(Q("zero" if s else named[p]) for p, s in zip(places, steers, strict=True))
-    values: Fields = {"name": [name_joint(template, place) for place in places]}
+    values: Fields = {"name": [name_joint(template, corner) for corner in places]}
     values |= {"position": turned} if fields != "velocity" else {}
     values |= {"velocity": rolling} if fields != "position" else {}
     return Published(topic, "sensor_msgs/msg/JointState", source, values)

@@ -98,8 +98,8 @@ class Figures:
         if "slip" in tables and shown.view.effects:
             followed = pl.col("input").cast(pl.String) == source
             part, rest = tables["slip"].filter(followed), tables["slip"].filter(~followed)
-            left = find_residual_modulus(shown.predict(part["t"].to_numpy()), part, length=self._length)
-            part = part.with_columns(pl.Series("modulus", left).fill_nan(None))
+            modulus = find_residual_modulus(shown.predict(part["t"].to_numpy()), part, length=self._length)
+            part = part.with_columns(pl.Series("modulus", modulus).fill_nan(None))
             tables["slip"] = pl.concat([part.filter(pl.col("modulus").is_not_null()), rest])
         budget = tuple(shown.apportion(self._length)) if with_budget else ()
         diagnosis = RunDiagnosis(input=source, budget=budget)

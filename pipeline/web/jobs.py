@@ -288,8 +288,8 @@ class Jobs:
         if code:
             # The page offers a list instead of command-line options.
             reason = f"{reason}: choose it from the list" if _ASKED in code else reason
-            told = reason.replace(str(task.path), job.name)
-            job.run, job.error = "", {"code": code, "message": told, "hint": hint}
+            message = reason.replace(str(task.path), job.name)
+            job.run, job.error = "", {"code": code, "message": message, "hint": hint}
         # A process that was ended is gone before its files are.
         for process in multiprocessing.active_children():
             process.join(_END_S)

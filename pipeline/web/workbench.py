@@ -38,7 +38,7 @@ class Trial:
         model: the model with its present values.
         total: number of effects to try; None before they are ranked.
         tried: number of effects tried so far.
-        found: effects that reduce the error, as JSON, in order of the decrease of both errors over 2 s.
+        helpful: effects that reduce the error, as JSON, in order of the decrease of both errors over 2 s.
         stopped: whether another one takes its place.
     """
 
@@ -46,7 +46,7 @@ class Trial:
     model: Model
     total: int | None = None
     tried: int = 0
-    found: list[dict[str, object]] = field(default_factory=list)
+    helpful: list[dict[str, object]] = field(default_factory=list)
     stopped: bool = False
 
     def run(self) -> None:
@@ -59,7 +59,7 @@ class Trial:
             self.total = len(tries.candidates)
             for addition in tries.try_each():
                 additions += [] if addition is None else [addition]
-                self.found = [show_addition(one, tries.before, model) for one in tries.fold(additions)]
+                self.helpful = [show_addition(one, tries.before, model) for one in tries.fold(additions)]
                 self.tried += 1
                 if self.stopped:
                     return
@@ -72,7 +72,7 @@ class Trial:
             "done": self.tried == self.total,
             "tried": self.tried,
             "total": self.total,
-            "found": self.found,
+            "found": self.helpful,
         }
 
 

@@ -142,6 +142,7 @@ def list_options(command: App) -> set[str]:
     }
 
 
+@pytest.mark.lint
 def test_no_text_of_the_program_names_a_command_or_an_option_that_is_not_there() -> None:
     assert [f"{place}: {wrong}" for place, text in list_texts() for wrong in find_wrong(text)] == []
 

@@ -69,6 +69,7 @@ def test_what_set_up_compiles_is_what_a_diagnosis_calls(samples: Path, tmp_path:
     assert _list_cached(cache) == compiled
 
 
+@pytest.mark.long
 def test_the_python_source_gives_the_numbers_of_the_machine_code(tmp_path: Path) -> None:
     cache = Path(os.environ.get("NUMBA_CACHE_DIR", tmp_path))
     compiled = [float(line) for line in _run(cache, "-c", CALL).split()]

@@ -242,6 +242,7 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     assert "would remain over 2 s" in describe([run])
 
 
+@pytest.mark.long
 def test_a_wheel_out_of_round_is_told_by_what_it_has_turned(tmp_path: Path) -> None:
     def wobble(state: State) -> tuple[float, float, float]:
         missed = 0.06 * math.sin(state.right_angle) * _SCENE.vehicle.wheel_radius_m * state.right_speed
@@ -275,6 +276,7 @@ def test_motion_that_lasts_is_unexplained_and_its_own_past_predicts_it(tmp_path:
     assert run.noise_floor.velocity_rms[2] < 0.7 * run.ladder[-1].velocity_rms[2]
 
 
+@pytest.mark.long
 def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

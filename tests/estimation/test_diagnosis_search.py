@@ -97,6 +97,7 @@ def test_a_delay_beside_limits_is_found_from_the_wrong_hollow_of_the_loss(tmp_pa
     assert {e.id: next(iter(e.values.values())) for e in found.effects} == pytest.approx(true, rel=0.05)
 
 
+@pytest.mark.long
 def test_a_dead_time_and_a_limited_torque_take_the_place_of_a_lag_and_a_ramp(tmp_path: Path) -> None:
     """Two effects for two, in a minute of driving: no exchange of one of them is better."""
     effects = {

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from few import few
 from simulated_platforms import simulate_platform
 
 from pipeline.analysis import Options
@@ -99,6 +98,7 @@ def test_on_level_ground_no_slope_loads_the_wheels() -> None:
     assert not load.can_show(Conditions(largest, encoders=True))
 
 
+@pytest.mark.long
 def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp_path: Path) -> None:
     """4 m/s^2 are 78 rad/s^2 of a wheel of 5 cm: it was named a brake lag and a pause of reversals."""
     hidden = {"acceleration_limit": 78.0, "steering_lag": 0.1, "steering_gain": 0.88}
@@ -138,6 +138,7 @@ def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(tmp_path: Path) -> 
     assert named["motor_imbalance"]["e"].value == pytest.approx(0.22, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_lag_behind_a_limit_is_no_torque_limit(tmp_path: Path) -> None:
     """A second limit of the same size differed by a millimetre, and was taken for what it imitated."""
     hidden = {"drive_lag": {"tau": 0.315}, "acceleration_limit": {"limit": 3.66}}
@@ -153,6 +154,7 @@ def test_a_lag_behind_a_limit_is_no_torque_limit(tmp_path: Path) -> None:
     assert {effect.id for effect in told.effects} == {*hidden}
 
 
+@pytest.mark.long
 def test_a_load_taken_on_halfway_is_a_change(tmp_path: Path) -> None:
     """Seven percent less travel from a moment on, beyond any doubt, was too small for a name."""
     scenario = Scenario(
@@ -167,7 +169,8 @@ def test_a_load_taken_on_halfway_is_a_change(tmp_path: Path) -> None:
     assert named.parameters["k_v"].value == pytest.approx(0.93, abs=0.01)
 
 
-@pytest.mark.parametrize("seed", few([1, 2], 2))
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_circle_one_way_does_not_decide_what_turns_it(seed: int, tmp_path: Path) -> None:
     """Sideways effects of a millimetre, which kept nothing of their promise, took the places of rivals."""
     time = np.arange(0.0, 90.0, 0.05)

@@ -56,6 +56,7 @@ def test_encoders_that_misread_are_named_with_the_line_that_mends_them(reads: fl
     assert "encoder_scale" not in {one.id for one in mended.findings}
 
 
+@pytest.mark.long
 def test_a_radius_and_a_gain_that_do_not_undo_each_other_are_both_named(tmp_path: Path) -> None:
     judged = judge(tmp_path, {"wheel_radius": 1.05, "drive_gain": 0.9}, 1.0)
     assert list_ids(judged) == {"drive_lag", "wheel_radius", "drive_gain"}
@@ -66,6 +67,7 @@ def test_a_radius_alone_is_named(tmp_path: Path) -> None:
     assert list_ids(judge(tmp_path, {"wheel_radius": 1.05}, 1.0)) == {"drive_lag", "wheel_radius"}
 
 
+@pytest.mark.long
 def test_a_coincidence_is_said_and_can_be_claimed(tmp_path: Path) -> None:
     """No signal tells wheels of another radius behind a gain that undoes it from encoders that misread."""
     effects = {"wheel_radius": 1.0 / 0.95, "drive_gain": 0.95}

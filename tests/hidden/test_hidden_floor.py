@@ -58,6 +58,7 @@ def _measure_floor(effects: dict[str, dict[str, float]], folder: Path) -> float:
     return assess_model(data, model).floor.r_mrmse_rad
 
 
+@pytest.mark.long
 def test_a_ground_that_changes_half_way_does_not_change_the_noise_floor(tmp_path: Path) -> None:
     """Of a model that has the change: the ideal model leaves it, and takes it for noise."""
     empty = _measure_floor({}, tmp_path / "empty")

@@ -38,7 +38,7 @@ def pause(timeout_s: float, effect: str = "drive_lag", size: float = 0.3) -> Sce
             (0.5, "acceleration_limit", 4.0),
             (1.0, "acceleration_limit", 4.0),
         ],
-        3,
+        5,
     ),
     ids=str,
 )

@@ -97,7 +97,9 @@ def test_what_has_no_level_is_refused(
         fit_levels(np.array(values), groups, None if errors is None else np.array(errors))
 
 
-@pytest.mark.parametrize("sizes", [(3, 2, 2, 1, 1), (3, 1), (6, 6, 6)])
+@pytest.mark.parametrize(
+    "sizes", [(3, 1), *(pytest.param(one, marks=pytest.mark.long) for one in ((3, 2, 2, 1, 1), (6, 6, 6)))]
+)
 def test_grounds_that_are_one_alarm_once_in_twenty(sizes: tuple[int, ...]) -> None:
     rng, repetitions = np.random.default_rng([len(sizes), *sizes]), 300
     alarms = 0
