@@ -64,12 +64,12 @@ what two bring in .86."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.85 has a standard error of 0.018."""
 _OFTEN = 0.1
-"""Share of them in which others in its place must cost less, for the data not to decide between them."""
+"""Share of them in which others in its place that cost more than `EQUAL` must cost less, to be as good."""
 _PROMISING = 0.5
 """Share of what an effect brings that others in its place may promise less, to be fitted."""
 _FAR = 4.0 * EQUAL
 """How far behind their fits end."""
-_RIVALS = 3
+_RIVALS = 8
 """Others that are fitted in the place of each effect."""
 _ROUNDS = 14
 """Most times that a model is improved."""
@@ -453,7 +453,7 @@ class Search:
         return {one.id: judge(fit, one, matrix, self.conditions, self.least_t) for one in asked}
 
     def _list_rivals(self, final: PathFit, matrix: Matrix, judged: dict[str, Judged]) -> Iterator[Rival]:
-        """Effects that in a tenth of resampled recordings would be in the place of one that is named."""
+        """Effects as good as one that is named, or better in a tenth of resampled recordings."""
         own = _sum_blocks(final, final.noise)
         weights = _resample(own.size)
         for name in (name for name, one in judged.items() if not one.refusal):
@@ -472,9 +472,10 @@ class Search:
                     continue
                 behind = _sum_blocks(fit, final.noise) - own
                 price = _find_price(fit.state, fit.numbers) - _find_price(final.state, final.numbers)
+                apart = find_cost(fit) - find_cost(final)
                 is_often = float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN
-                if is_often and find_cost(fit) < find_cost(final) + _FAR:
-                    yield Rival(name, other, fit, find_cost(fit) - find_cost(final))
+                if apart < EQUAL or (is_often and apart < _FAR):
+                    yield Rival(name, other, fit, apart)
 
 
 def _fit_under(

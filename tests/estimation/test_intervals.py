@@ -38,10 +38,10 @@ def test_errors_of_clocks_are_carried_into_the_numbers_that_they_move(
 ) -> None:
     fitted = fit({"effective_track": 1.7}, "effective_track", "lateral_skid")
     path: PathResiduals = fitted.fits[0].path
-    assert (path.list_clock_errors() > 0.0).all()
+    assert (path.list_clock_errors(fitted.state) > 0.0).all()
 
     def estimate(error_s: float) -> Estimates:
-        monkeypatch.setattr(path, "list_clock_errors", lambda: np.array([error_s]))
+        monkeypatch.setattr(path, "list_clock_errors", lambda _: np.array([error_s]))
         return estimate_intervals(fitted)
 
     exact, usual, poor = (estimate(error) for error in (0.0, 0.02, 0.1))

@@ -21,10 +21,17 @@ def test_a_limit_is_searched_above_what_wheels_exceed() -> None:
     data = EstimationData([run], HUSKY, Input.COMMAND)
     assert data.exceeded["wheel"] == pytest.approx(4.0, rel=0.03)
     (path,) = (one for one in data.paths if isinstance(one, WheelResiduals))
-    (number,) = path.list_free(data.start_state([find_effect("wheel_speed_limit")(limit=4.0)]))
+    number, late = path.list_free(data.start_state([find_effect("wheel_speed_limit")(limit=4.0)]))
     assert number.bounds[0] == pytest.approx(data.exceeded["wheel"] / OVERSHOOT)
-    (lag,) = path.list_free(data.start_state([find_effect("drive_lag")(tau=0.3)]))
+    lag, _ = path.list_free(data.start_state([find_effect("drive_lag")(tau=0.3)]))
     assert lag.bounds[0] == 0.0
+    # What encoders report is up to two periods old; a jump after a reading seems half a period early.
+    period = data.runs[0].wheel_period_s
+    assert late.label == "timing.encoder_delay_s"
+    assert late.bounds == pytest.approx((-0.5 * period, 2.0 * period))
+    # A delay of the commands is that of the encoders, too.
+    (delay,) = path.list_free(data.start_state([find_effect("transport_delay")(d=0.2)]))
+    assert delay.label == "transport_delay.d"
 
 
 @pytest.mark.parametrize(

@@ -278,8 +278,8 @@ def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_no
 
 
 def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:
-    data = EstimationData([simulate({}, duration_s=40.0)], HUSKY, Input.COMMAND)
-    item = estimate_intervals(fit_model(data, model_of("drive_lag"))).find("drive_lag.tau")
+    data = EstimationData([simulate({}, duration_s=40.0)], HUSKY, Input.MEASURED)
+    item = estimate_intervals(fit_model(data, model_of("body_inertia"))).find("body_inertia.tau")
     assert item.low == item.free.bounds[0] > item.value - item.half
     # Other runs are weighed by all of it.
     assert item.deviation > (item.high - item.low) / 3.92
