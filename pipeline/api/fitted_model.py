@@ -12,7 +12,7 @@ import polars as pl
 from threadpoolctl import threadpool_limits
 
 from pipeline.core import INPUT_WORDS, number_in, objects_in
-from pipeline.datasets import ModelFit, fit_to_runs, read_runs
+from pipeline.datasets import ModelFit, fit_to_runs, put_on_runs
 from pipeline.estimation import EstimationData, ModelState
 from pipeline.estimation.additions import Tries
 from pipeline.estimation.errors import errors_as_json
@@ -391,8 +391,7 @@ class Model:
     def _read(
         self, runs: StoredRun | Sequence[StoredRun], owner: Owner | None
     ) -> tuple[ModelFile, list[MotionRun]]:
-        vehicle, read = read_runs(_list_manifests(runs), self.file.model.vehicle, owner)
-        return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
+        return put_on_runs(self.file, _list_manifests(runs), owner)
 
     def __repr__(self) -> str:
         numbers = format_parameters(list_parameters(self.file))

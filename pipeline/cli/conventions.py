@@ -11,7 +11,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
@@ -181,12 +181,6 @@ def print_note(text: str) -> None:
     """One line on stderr, at once."""
     sys.stderr.write(f"{tidy_line(text)}\n")
     sys.stderr.flush()
-
-
-def print_warnings(texts: Iterable[str]) -> None:
-    """Print warnings on standard error, a line each."""
-    for text in texts:
-        print_note(f"slip: {text}")
 
 
 @contextmanager
@@ -395,16 +389,13 @@ OwnEffects = Annotated[
 
 
 @contextmanager
-def open_shown(
-    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = print_note
-) -> Iterator[OpenedRun]:
-    """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
+def open_shown(name: str, options: Options, *, quiet: bool) -> Iterator[OpenedRun]:
+    """A run as `open_run` gives it; its progress is shown, and its note said."""
     from pipeline.analysis.analyze import open_run  # noqa: PLC0415 - heavy
 
-    with (
-        show_progress(Path(name).name, quiet=quiet) as progress,
-        open_run(name, options, progress) as opened,
-    ):
+    with ExitStack() as stack:
+        with show_progress(Path(name).name, quiet=quiet) as progress:
+            opened = stack.enter_context(open_run(name, options, progress))
+        if opened.note and not quiet:
+            print_note(f"slip: {opened.note}")
         yield opened
-    if opened.note and not quiet:
-        notify(f"slip: {opened.note}")
