@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
@@ -21,7 +21,7 @@ from cyclopts.types import PositiveFloat
 
 from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.batch import parse_memory_limit, parse_size
-from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, limit_memory, measure_memory, shorten
+from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, measure_memory, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
@@ -205,62 +205,69 @@ _SHARE = 0.8
 
 
 @dataclass
-class MemoryLimit:
-    """The memory limit of a command, and what it says when it ends for it.
+class Answer:
+    """What a command answers on logs, also where it ends for its memory limit.
 
     Attributes:
-        given: the limit as it was typed, for example 2GB; None for a share of the machine's memory.
+        memory: the limit as it was typed, for example 2GB; None for a share of the machine's memory.
+        is_json: whether it is asked for as one JSON object.
         at_work: which file is being worked on.
-        conclude: prints the error, and the results so far, as JSON, where that was asked for.
+        list_runs: the runs so far as JSON objects.
+        errors: errors as JSON objects; each affects only one log.
     """
 
-    given: str | None = None
+    memory: str | None
+    is_json: bool
     at_work: str = ""
-    conclude: Callable[[SlipError], None] | None = None
+    list_runs: Callable[[], Sequence[object]] = list
+    errors: list[dict[str, str]] = field(default_factory=list)
 
     @property
     def limit_bytes(self) -> int:
-        """The limit of the process [bytes].
+        """The memory limit of the process [bytes].
 
         Raises:
             BatchError: ``bad_size``, ``memory_too_small``.
         """
-        return int(_SHARE * measure_memory()) if self.given is None else parse_memory_limit(self.given)
+        return int(_SHARE * measure_memory()) if self.memory is None else parse_memory_limit(self.memory)
+
+    @contextmanager
+    def attempt(self, log: str) -> Iterator[None]:
+        """Work on a log, or another file: its error is printed, and the others go on."""
+        self.at_work = log
+        try:
+            yield
+        except SlipError as error:
+            self._note(log, error)
+
+    def to_json(self) -> dict[str, object]:
+        """Runs and errors as one JSON object."""
+        return {"runs": self.list_runs(), "errors": self.errors}
 
     def end(self, held: int) -> None:
         """End the process with one line; what it has written stays as it was, as after a kill."""
         what = f"the command used {held / 1e9:.2g} GB of memory, more than {self.limit_bytes / 1e9:.2g} GB"
         hint = "Give it more with --memory, or leave out what is that large"
-        error = SlipError("out_of_memory", what, where=self.at_work, hint=hint)
-        print_error(error)
-        if self.conclude is not None:
-            self.conclude(error)
+        self._note(self.at_work, SlipError("out_of_memory", what, where=self.at_work, hint=hint))
+        if self.is_json:
+            # One line: those who read `watch` read line by line.
+            sys.stdout.write(json.dumps(self.to_json()) + "\n")
         sys.stdout.flush()
         # Only this ends a library's computation.
         os._exit(FAILED)
 
-
-Limit: TypeAlias = Annotated[MemoryLimit, Parameter(parse=False)]
-"""The memory limit of the command, given by `main` to the verbs that say more at their end."""
-
-
-@contextmanager
-def limited_memory(limit: MemoryLimit) -> Iterator[None]:
-    """Hold a command to its memory limit.
-
-    Raises:
-        BatchError: ``bad_size``, ``memory_too_small``.
-    """
-    with limit_memory(limit.limit_bytes, limit.end):
-        yield
+    def _note(self, log: str, error: SlipError) -> None:
+        print_error(error)
+        self.errors.append(summarize_error(log, error))
 
 
-def refuse_json(words: Sequence[str], error: SlipError) -> None:
-    """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
-    if "--json" in itertools.takewhile(lambda word: word != "--", words):
-        content = {"runs": [], "errors": [summarize_error(error.where, error)]}
-        # One line: those who read `watch` read line by line.
-        sys.stdout.write(json.dumps(content) + "\n")
+Asked: TypeAlias = Annotated[Answer, Parameter(parse=False)]
+"""The answer of the command, given by `main` to the verbs that say more at their end."""
+
+
+def is_json(words: Sequence[str]) -> bool:
+    """Whether these words of a command ask for one JSON object."""
+    return "--json" in itertools.takewhile(lambda word: word != "--", words)
 
 
 def _require_local(_kind: object, results: Path) -> None:

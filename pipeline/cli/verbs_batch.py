@@ -22,8 +22,8 @@ from pipeline.cli.conventions import (
     EXPLAINED,
     FAILED,
     LOSSY,
+    Asked,
     Choices,
-    Limit,
     build_options,
     explain_logs,
     format_counts,
@@ -59,7 +59,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     force: bool = False,
     retry_quarantined: bool = False,
     timeout: PositiveFloat = 3600.0,
-    limit: Limit,
+    asked: Asked,
     settle: NonNegativeFloat = 120.0,
     prune: bool = False,
     keep: NonNegativeInt = 1,
@@ -109,8 +109,8 @@ def batch(  # noqa: D417 - the shared choices document themselves
         shard=None if shard is None else parse_shard(shard),
         timeout_s=timeout,
         memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
-        if limit.given is None
-        else limit.limit_bytes,
+        if asked.memory is None
+        else asked.limit_bytes,
         settle_s=settle,
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,

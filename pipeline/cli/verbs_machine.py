@@ -22,7 +22,7 @@ from cyclopts.types import PositiveFloat
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
-    Limit,
+    Asked,
     OwnEffects,
     Results,
     print_json,
@@ -41,7 +41,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     effects: OwnEffects = None,
     timeout: PositiveFloat = 1800.0,
-    limit: Limit,
+    asked: Asked,
     open_browser: Annotated[bool, Parameter(name="--open")] = False,
     json: bool = False,
     quiet: bool = False,
@@ -88,7 +88,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         )
     limits = Limits(
         timeout_s=timeout,
-        memory_bytes=measure_memory() // 2 if limit.given is None else limit.limit_bytes,
+        memory_bytes=measure_memory() // 2 if asked.memory is None else asked.limit_bytes,
     )
     opened = ""
     # A folder that is not there yet is filled by dropped logs.
