@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import store
 from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.batch import parse_memory_limit, parse_size
 from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, measure_memory, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
-    from pipeline.store import Store
 
 CLEAN = 0
 FAILED = 1
@@ -370,17 +370,15 @@ def _list_overrides(choices: Choices) -> Mapping[str, object]:
     return given_again
 
 
-def open_results(results: Path) -> Store:
+def open_results(results: Path) -> store.Store:
     """The results in a folder.
 
     Raises:
         StoreError: ``no_results``, there is no such folder.
     """
-    from pipeline.store import Store, no_results  # noqa: PLC0415 - verbs that only help need none
-
     if not results.is_dir():
-        raise no_results(results)
-    return Store(results)
+        raise store.no_results(results)
+    return store.Store(results)
 
 
 def format_vehicle_source(source: str) -> str:

@@ -6,9 +6,10 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from pipeline import words
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
@@ -27,9 +28,10 @@ from pipeline.core import (
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, has_no_pose, read_findings, read_result
+from pipeline.words.diagnosis import list_lines
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
 
     from pipeline.batch.batch_run import Line
 
@@ -43,24 +45,17 @@ class SilentWatch:
     def notify(self, line: Line, size: int) -> None:
         """Ignored."""
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        return None
-
-
-class LineWatch(SilentWatch):
+class LineWatch:
     """One line a log on stderr."""
 
     def __init__(self) -> None:
         self._started = time.monotonic()
-        self._todo = self._done = 0
-        self._size = self._read = 0
+        self._todo = self._done = self._size = self._read = 0
 
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
-        self._begin(todo, size)
+        self._started, self._todo, self._size = time.monotonic(), todo, size
         print_note(f"{format_count(todo, 'log')} to work on ({format_size(size)}), {settled} already done")
 
     def notify(self, line: Line, size: int) -> None:
@@ -73,63 +68,43 @@ class LineWatch(SilentWatch):
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){remaining}"
         )
 
-    def _begin(self, todo: int, size: int) -> None:
-        self._todo, self._size = todo, size
-        self._started = time.monotonic()
-
     def estimate_rest(self) -> float:
         """Seconds that the rest takes if a byte of it, or else a log, takes as long as those before."""
         share = self._read / self._size if self._read else self._done / self._todo
         return (time.monotonic() - self._started) * (1.0 - share) / share
 
 
-class BarWatch(LineWatch):
+class BarWatch:
     """A bar on a terminal; only what went wrong gets a line."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn  # noqa: PLC0415
-        from rich.progress import Progress as Bar  # noqa: PLC0415
-
-        columns = (
-            "{task.description}",
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[remaining]}"),
-        )
-        self._bar: Progress = Bar(*columns, console=Console(stderr=True))
-        self._task: TaskID | None = None
+    def __init__(self, bar: Progress) -> None:
+        self._bar, self._task = bar, bar.add_task("logs", total=None)
 
     def plan(self, todo: int, settled: int, size: int) -> None:
-        """Show the bar."""
-        self._begin(todo, size)
-        del settled
-        self._task = self._bar.add_task("logs", total=todo, remaining="")
-        self._bar.start()
+        """Show how much there is to do."""
+        del settled, size
+        self._bar.update(self._task, total=todo)
 
     def notify(self, line: Line, size: int) -> None:
         """Move the bar on."""
-        self._done += 1
-        self._read += size
+        del size
         if line.reason:
             text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
-        if self._task is not None:
-            remaining = (
-                f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
-            )
-            self._bar.update(self._task, advance=1, remaining=remaining)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        self._bar.advance(self._task)
 
 
-def open_watch(*, quiet: bool) -> SilentWatch:
+@contextmanager
+def open_watch(*, quiet: bool) -> Iterator[SilentWatch | LineWatch | BarWatch]:
     """Whoever fits the place: nobody, a bar, or lines."""
-    if quiet:
-        return SilentWatch()
-    return BarWatch() if sys.stderr.isatty() else LineWatch()
+    if quiet or not sys.stderr.isatty():
+        yield SilentWatch() if quiet else LineWatch()
+        return
+    from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
+    from rich.progress import Progress  # noqa: PLC0415 - likewise
+
+    with Progress(console=Console(stderr=True)) as bar:
+        yield BarWatch(bar)
 
 
 Summary = Mapping[str, object]
@@ -295,8 +270,6 @@ def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> lis
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
-    from pipeline.words.diagnosis import list_lines  # noqa: PLC0415 - heavy
-
     stored = mapping_in(summary, "diagnosis")
     if not stored:
         return []

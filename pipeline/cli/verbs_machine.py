@@ -19,6 +19,7 @@ from urllib.parse import urlencode
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import core, models, store
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
@@ -64,12 +65,10 @@ def serve(  # noqa: D417 - the results folder documents itself
     """
     for package in ("uvicorn", "starlette", "numba", "vl_convert"):
         require_package(package, "serve", "the workbench")
-    from pipeline.models import load_effects  # noqa: PLC0415 - heavy
-    from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
     from pipeline.web import LOOPBACK, Limits  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 
-    load_effects(effects or ())
+    models.load_effects(effects or ())
 
     def notify(address: str, token: str) -> None:
         whole = f"{address}?token={token}{opened}"
@@ -93,10 +92,10 @@ def serve(  # noqa: D417 - the results folder documents itself
     opened = ""
     # A folder that is not there yet is filled by dropped logs.
     named = None if run is None else Path(run)
-    if named is not None and (named.is_dir() or not (named.exists() or Store(results).runs())):
+    if named is not None and (named.is_dir() or not (named.exists() or store.Store(results).runs())):
         results = named
     elif run is not None:
-        opened = f"#{urlencode({'a': find_run(run, Store(results)).run})}"
+        opened = f"#{urlencode({'a': store.find_run(run, store.Store(results)).run})}"
     serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)
     return CLEAN
 
@@ -223,21 +222,17 @@ def _read_numbers(version: str) -> list[int]:
 
 def compile_every_loop() -> int:
     """Compile the loops of all files; the number of loops compiled."""
-    from pipeline.core import compile_loops  # noqa: PLC0415 - heavy
-
     root = Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
         if "\n@compiled" in path.read_text(encoding="utf-8"):
             importlib.import_module(".".join(("pipeline", *path.relative_to(root).with_suffix("").parts)))
-    return compile_loops()
+    return core.compile_loops()
 
 
 def _look_at_loops() -> Check:
-    from pipeline.core import list_caches  # noqa: PLC0415 - heavy
-
     name = "compiled loops"
     count = compile_every_loop()
-    caches = list_caches()
+    caches = core.list_caches()
     if find_spec("numba") is None:
         hint = f"For diagnoses: pip install '{PACKAGE}[diagnose]'"
         return Check(name, "optional", "Numba is not installed; slip tables do without it", hint)
