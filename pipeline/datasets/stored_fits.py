@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from pipeline.core import NORMAL_95
 from pipeline.datasets.compared_runs import find_run_refusal
-from pipeline.datasets.fleet import Expected, expect_run
+from pipeline.datasets.fleet import expect_here
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.errors import Errors, errors_as_json
@@ -165,7 +165,7 @@ def fit_to_runs(
     _require_fitted([effect for effect in after.model if effect.id not in before.model.ids], runs, chosen)
     data = EstimationData(runs, after.model.vehicle, chosen.source)
     if fleet is not None:
-        data = data.with_prior(_expect_here(runs, after.model.vehicle, chosen.source, fleet).prior)
+        data = data.with_prior(expect_here(runs, after.model.vehicle.id, chosen.source.value, fleet).prior)
     known = replace(before.model, vehicle=after.model.vehicle)
     old = new = assess_model(data, known, per_run=before.per_run)
     if after.model.effects != known.effects:
@@ -186,21 +186,7 @@ def expect_model(
     """
     vehicle, runs = read_runs(manifests, None, owner)
     chosen = choose_input(runs, source)
-    return ModelFile(Model(vehicle, _expect_here(runs, vehicle, chosen.source, fleet).effects))
-
-
-def _expect_here(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input, fleet: Store) -> Expected:
-    """What a fleet expects on the ground of these runs, which themselves do not count."""
-    terrains = sorted({run.terrain for run in runs})
-    if len(terrains) > 1:
-        raise MotionError(
-            "several_terrains",
-            f"the runs are on {', '.join(terrains)}, and a prior applies to one terrain",
-            where=", ".join(run.name for run in runs),
-            hint="Fit the runs of each terrain separately.",
-        )
-    without = [run.sha256 for run in runs]
-    return expect_run(fleet, vehicle.id, terrains[0], source.value, without=without)
+    return ModelFile(Model(vehicle, expect_here(runs, vehicle.id, chosen.source.value, fleet).effects))
 
 
 def judge_measured(file: ModelFile, manifests: Sequence[Manifest]) -> ModelFile:
