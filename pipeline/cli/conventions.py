@@ -64,16 +64,14 @@ def _spell_out(character: str) -> str:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower."""
-    width = _measure_screen()
+    """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower.
+
+    The screen is as wide as COLUMNS says, else the terminal; what is no terminal is not folded.
+    """
+    columns = os.environ.get("COLUMNS", "")
+    seen = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    width = (int(columns) if columns.isdecimal() else 0) or seen
     sys.stdout.write("".join(f"{part}\n" for line in lines for part in fold_line(tidy_line(line), width)))
-
-
-def _measure_screen() -> int:
-    """Columns of the terminal, or COLUMNS if set; 0 (no folding) if the output is not a terminal."""
-    width = os.environ.get("COLUMNS", "")
-    seen = int(width) if width.isdecimal() else 0
-    return seen or (shutil.get_terminal_size().columns if sys.stdout.isatty() else 0)
 
 
 def fold_line(line: str, width: int) -> list[str]:
@@ -327,11 +325,24 @@ def build_options(choices: Choices) -> Options:
     Raises:
         BatchError: ``bad_size``.
     """
+    said: dict[str, dict[str, object]] = {
+        "vehicle": {
+            "preset": choices.vehicle,
+            "wheel_radius_m": choices.wheel_radius,
+            "track_width_m": choices.track_width,
+        },
+        "run": {"dataset": choices.dataset, "terrain": choices.terrain},
+        "velocity": {"yaw": choices.yaw},
+    }
+    given = {section: {k: v for k, v in values.items() if v is not None} for section, values in said.items()}
+    overrides: dict[str, object] = {section: values for section, values in given.items() if values}
+    if choices.interval == "all":
+        overrides["use_intervals"] = "all"
     return Options(
         max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
         out=choices.results,
         config=choices.config,
-        overrides=_list_overrides(choices),
+        overrides=overrides,
         inputs=INPUTS if choices.input == "both" else (choices.input,),
         report=False,
     )
@@ -347,27 +358,6 @@ def spell_flags(values: Mapping[str, object]) -> str:
     """Flags with their values, a space before each; what is None is left out."""
     said = {name: value for name, value in values.items() if value is not None}
     return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in said.items())
-
-
-def _list_overrides(choices: Choices) -> Mapping[str, object]:
-    """Configuration values from the command line."""
-    said: dict[str, dict[str, object]] = {
-        "vehicle": {
-            "preset": choices.vehicle,
-            "wheel_radius_m": choices.wheel_radius,
-            "track_width_m": choices.track_width,
-        },
-        "run": {"dataset": choices.dataset, "terrain": choices.terrain},
-        "velocity": {"yaw": choices.yaw},
-    }
-    given_again: dict[str, object] = {}
-    for section, values in said.items():
-        given = {key: value for key, value in values.items() if value is not None}
-        if given:
-            given_again[section] = given
-    if choices.interval == "all":
-        given_again["use_intervals"] = "all"
-    return given_again
 
 
 def open_results(results: Path) -> store.Store:

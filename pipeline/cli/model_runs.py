@@ -110,7 +110,8 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
     if name is None:
         every = models.list_literature()
         content = {"models": [_as_json(model) for model in every]}
-        return print_result(content, lambda: [_list_model(model) for model in every], json=json)
+        rows = [(f"{one.name:<28}", format_count(one.count_numbers(), "number"), one.title) for one in every]
+        return print_result(content, lambda: [f"{a} {b:<14} {c}" for a, b, c in rows], json=json)
     model = models.find_model(name)
     return print_result(_as_json(model), lambda: _format_model(model), json=json)
 
@@ -128,12 +129,6 @@ def _as_json(model: models.LiteratureModel) -> dict[str, object]:
         "terms": dict(model.terms),
         "needs": model.needs,
     }
-
-
-def _list_model(model: models.LiteratureModel) -> str:
-    number = model.count_numbers()
-    count = format_count(number, "number")
-    return f"{model.name:<28} {count:<14} {model.title}"
 
 
 def _format_model(model: models.LiteratureModel) -> list[str]:

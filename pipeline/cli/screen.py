@@ -129,13 +129,18 @@ def format_run(
     verdict = str(summary.get("verdict") or "")
     head, first = _format_head(summary), [verdict] if verdict else []
     is_excluded = RunReport(summary).refusal
+    # Those of the run and of its diagnosis that need attention, except what the verdict says.
+    findings = read_findings(summary)
+    known = {finding.text for finding in findings}
+    own = read_findings(mapping_in(summary, "diagnosis"))
+    told = [*findings, *(one for one in own if one.text not in known)]
     # If the data are invalid, this is stated first.
     lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
         *([] if is_excluded and not everything else _format_slip(summary, everything=everything)),
         *(_format_topics(summary) if everything else []),
         *_format_diagnosis(summary, everything=everything),
-        *_format_findings(summary, verdict, everything=everything),
+        *(_row(*row) for row in words.list_findings({"": told}, verdict, everything=everything)),
         *([_row("same", f"content as {twin}: counted once, under that name")] if twin else []),
         *_format_end(summary, said, unchanged=unchanged),
     ]
@@ -161,8 +166,9 @@ def _format_head(summary: Summary) -> list[str]:
     log = mapping_in(summary, "log")
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
+    named = [(key, str(summary[key])) for key in ("vehicle", "terrain")]
     facts = [
-        *(_name_known(summary, key) for key in ("vehicle", "terrain")),
+        *(f"{key} unknown" if name == "unknown" else name for key, name in named),
         format_recorded(seconds, summary.get("duration_s")),
     ]
     if isinstance(distance, (int, float)):
@@ -174,27 +180,16 @@ def _format_head(summary: Summary) -> list[str]:
     # The verdict states an error without the mark of a finding.
     errors = count_serious(objects_in(summary, "findings")).get("error")
     state += f", {errors}" if errors else ""
-    holes = _format_gaps(gaps[0]) if gaps else ""
-    head = [f"{summary['run']}    {' · '.join(facts)}    {state}{holes}"]
-    return head + [_row("lost", _format_loss(loss)) for loss in losses[:_SHOWN]]
-
-
-def _name_known(summary: Summary, key: str) -> str:
-    """The vehicle or the terrain of a run; `terrain unknown` where the log does not say it."""
-    name = str(summary[key])
-    return f"{key} unknown" if name == "unknown" else name
-
-
-def _format_loss(loss: Mapping[str, object]) -> str:
-    start, end = loss.get("start_s"), loss.get("end_s")
-    known = isinstance(start, (int, float)) and isinstance(end, (int, float))
-    return f"{loss['text']}" + (f" ({start:.1f} to {end:.1f} s of the log)" if known else "")
-
-
-def _format_gaps(gaps: Mapping[str, object]) -> str:
-    count, longest = cast("int", gaps["count"]), number_in(gaps, "value")
-    how_long = "" if longest is None else f" (longest {longest:.2g} s)"
-    return f", {count} gap{'s' if count != 1 else ''} in the poses{how_long}"
+    if gaps:
+        count, longest = cast("int", gaps[0]["count"]), number_in(gaps[0], "value")
+        how_long = "" if longest is None else f" (longest {longest:.2g} s)"
+        state += f", {count} gap{'s' if count != 1 else ''} in the poses{how_long}"
+    head = [f"{summary['run']}    {' · '.join(facts)}    {state}"]
+    for loss in losses[:_SHOWN]:
+        start, end = number_in(loss, "start_s"), number_in(loss, "end_s")
+        span = "" if start is None or end is None else f" ({start:.1f} to {end:.1f} s of the log)"
+        head.append(_row("lost", f"{loss['text']}{span}"))
+    return head
 
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
@@ -256,16 +251,6 @@ def _format_topics(summary: Summary) -> list[str]:
     rejected = others if isinstance(others, list) else []
     lines.extend(_row("", f"{'not':<9}{other['topic']}    {other['reason']}") for other in rejected)
     return lines
-
-
-def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
-    """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
-    findings = read_findings(summary)
-    known = {finding.text for finding in findings}
-    own = [one for one in read_findings(mapping_in(summary, "diagnosis")) if one.text not in known]
-    return [
-        _row(*row) for row in words.list_findings({"": [*findings, *own]}, verdict, everything=everything)
-    ]
 
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:

@@ -83,7 +83,11 @@ def plan(  # noqa: D417 - the runs document themselves
 
     seconds = planning.parse_time(time)
     gathered = _gather(names, options, quiet=quiet or json) if names else None
-    chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
+    chosen = sources.find_preset(vehicle or "") if gathered is None else gathered.vehicle
+    if chosen is None:
+        known = ", ".join(preset.id for preset in sources.list_presets())
+        what = f"no preset is called {vehicle!r}" if vehicle else "a plan needs a run or a vehicle"
+        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
     # Report wrong options before a long diagnosis.
     ground = planning.parse_area(area, chosen)
     with show_progress(at_work, quiet=quiet or json) as progress:
@@ -160,15 +164,6 @@ def _gather(
         where = ", ".join(recording.name for recording in recordings)
         raise SlipError("several_vehicles", what, where=where, hint="Give runs of one vehicle.")
     return _Gathered(vehicles[0], recordings, manifests, lossy)
-
-
-def _find_vehicle(name: str | None) -> sources.Vehicle:
-    vehicle = None if name is None else sources.find_preset(name)
-    if vehicle is None:
-        known = ", ".join(preset.id for preset in sources.list_presets())
-        what = "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}"
-        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
-    return vehicle
 
 
 def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
@@ -284,7 +279,12 @@ def simulate(  # noqa: D417 - arguments document themselves
             "cases": {one.name: one.shows for one in list_cases()},
             "effects": {one.id: one.formula for one in (*list_effects(), *list_written_effects())},
         }
-        return print_result(lists, lambda: _format_case(lists), json=json)
+        lines = [
+            line
+            for title, rows in lists.items()
+            for line in (title, *(f"  {row}" for row in align_rows(list(rows.items()))))
+        ]
+        return print_result(lists, lambda: lines, json=json)
     effects = dict(_parse_effect(text) for text in effect or [])
     if len(effects) < len(effect or []):
         hint = "Give all its numbers at once: --effect ID=NAME:VALUE,NAME:VALUE."
@@ -343,11 +343,3 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
         hint = "Give each number of an effect once."
         raise SlipError("number_twice", "a number is given twice", where=text, hint=hint)
     return name, numbers
-
-
-def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:
-    return [
-        line
-        for title, rows in lists.items()
-        for line in (title, *(f"  {row}" for row in align_rows(list(rows.items()))))
-    ]

@@ -204,7 +204,10 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     lines.append(f"health    {'complete' if not seen.losses else 'with losses'}{unchecked}")
     lines += _cut([f"  lost    {loss.text}" for loss in seen.losses], everything=everything)
     lines += _cut([f"  note    {note}" for note in seen.notes], everything=everything)
-    lines += _format_metadata(seen) if everything else []
+    if everything:
+        for name, record in index.metadata.items():
+            texts = [f"{key} = {' '.join(value.split())}" for key, value in record.items()]
+            lines.append(f"metadata  {shorten(name, LONGEST_NAME)}: {name_first(texts, _MOST_ENTRIES)}")
     # Of a log that cannot be analyzed any topic may tell why.
     lines += ["", *_format_topics(seen, everything=everything or seen.problem is not None), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
@@ -235,14 +238,6 @@ def _cut(lines: Sequence[str], *, everything: bool) -> list[str]:
     if everything or len(lines) <= _MOST_NOTES:
         return list(lines)
     return [*lines[:_MOST_NOTES], f"          {len(lines) - _MOST_NOTES} more (--all)"]
-
-
-def _format_metadata(seen: Inspection) -> list[str]:
-    return [
-        f"metadata  {shorten(name, LONGEST_NAME)}: "
-        + name_first([f"{key} = {' '.join(value.split())}" for key, value in record.items()], _MOST_ENTRIES)
-        for name, record in seen.index.metadata.items()
-    ]
 
 
 def _format_roles(seen: Inspection, *, everything: bool) -> list[str]:

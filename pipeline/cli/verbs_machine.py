@@ -168,12 +168,19 @@ def _look(results: Path) -> Iterator[Check]:
     yield _look_at_packages()
     yield _look_at_extras()
     yield _look_at_loops()
-    yield _look_for_browser()
+    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    lacking = "not found; reports and figures do without it"
+    hint = "" if path else "For pictures of pages and their tests: make browser"
+    yield Check("Chromium", "ok" if path else "optional", path or lacking, hint)
     # A missing folder is created in its nearest existing parent.
     parent = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
-    yield _look_at_disk(parent)
+    free = shutil.disk_usage(parent).free
+    hint = "" if free >= _LEAST_FREE_BYTES else "Free some, or name another disk with --results"
+    yield _judge("disk", f"{free / 1e9:.1f} GB free at {parent}", hint)
     yield _look_at_permission(parent)
-    yield _look_at_locale()
+    names, screen = sys.getfilesystemencoding(), sys.stdout.encoding
+    hint = "" if {names.lower(), screen.lower()} == {"utf-8"} else "Set LC_ALL=C.UTF-8, or PYTHONUTF8=1"
+    yield _judge("locale", f"file names in {names}, screen in {screen}", hint)
     yield _look_at_clock()
 
 
@@ -246,20 +253,6 @@ def _look_at_loops() -> Check:
     return Check(name, "ok", f"{count} kept in {os.path.commonpath([str(folder) for folder in caches])}")
 
 
-def _look_for_browser() -> Check:
-    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if path:
-        return Check("Chromium", "ok", path)
-    what = "not found; reports and figures do without it"
-    return Check("Chromium", "optional", what, "For pictures of pages and their tests: make browser")
-
-
-def _look_at_disk(folder: Path) -> Check:
-    free = shutil.disk_usage(folder).free
-    hint = "" if free >= _LEAST_FREE_BYTES else "Free some, or name another disk with --results"
-    return _judge("disk", f"{free / 1e9:.1f} GB free at {folder}", hint)
-
-
 def _look_at_permission(folder: Path) -> Check:
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -268,12 +261,6 @@ def _look_at_permission(folder: Path) -> Check:
         hint = "Give your user the right to write there, or name another folder with --results"
         return Check("permission", "problem", f"{folder} cannot be written to: {error.strerror}", hint)
     return Check("permission", "ok", f"{folder} can be written to")
-
-
-def _look_at_locale() -> Check:
-    names, screen = sys.getfilesystemencoding(), sys.stdout.encoding
-    hint = "" if {names.lower(), screen.lower()} == {"utf-8"} else "Set LC_ALL=C.UTF-8, or PYTHONUTF8=1"
-    return _judge("locale", f"file names in {names}, screen in {screen}", hint)
 
 
 def _look_at_clock() -> Check:
