@@ -101,9 +101,10 @@ def open_watch(*, quiet: bool) -> Iterator[SilentWatch | LineWatch | BarWatch]:
         yield SilentWatch() if quiet else LineWatch()
         return
     from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
-    from rich.progress import Progress  # noqa: PLC0415 - likewise
+    from rich.progress import MofNCompleteColumn, Progress  # noqa: PLC0415 - likewise
 
-    with Progress(console=Console(stderr=True)) as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
         yield BarWatch(bar)
 
 
