@@ -66,7 +66,7 @@ def _spell_out(character: str) -> str:
 def print_lines(lines: Iterable[str]) -> None:
     """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower.
 
-    The screen is as wide as COLUMNS says, else the terminal; what is no terminal is not folded.
+    The screen is as wide as COLUMNS says, else as the terminal; a file is not folded.
     """
     columns = os.environ.get("COLUMNS", "")
     seen = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0

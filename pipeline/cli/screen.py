@@ -134,14 +134,14 @@ def format_run(
     findings = read_findings(summary)
     known = {finding.text for finding in findings}
     own = read_findings(mapping_in(summary, "diagnosis"))
-    told = [*findings, *(one for one in own if one.text not in known)]
+    every = [*findings, *(one for one in own if one.text not in known)]
     # If the data are invalid, this is stated first.
     lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
         *([] if is_excluded and not everything else _format_slip(summary, everything=everything)),
         *(_format_topics(summary) if everything else []),
         *_format_diagnosis(summary, everything=everything),
-        *(_row(*row) for row in words.list_findings({"": told}, verdict, everything=everything)),
+        *(_row(*row) for row in words.list_findings({"": every}, verdict, everything=everything)),
         *([_row("same", f"content as {twin}: counted once, under that name")] if twin else []),
         *_format_end(summary, said, unchanged=unchanged),
     ]

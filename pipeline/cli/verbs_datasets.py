@@ -76,14 +76,14 @@ def compare(  # noqa: D417 - arguments document themselves
         results, datasets = Path(datasets[0]), datasets[1:]
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
-    kept = store.Store(results)
+    folder = store.Store(results)
     if causes:
-        compared = find_causes(kept, question)
-        written = write_causes(kept, compared, figures)
+        compared = find_causes(folder, question)
+        written = write_causes(folder, compared, figures)
         content, lines = compared.to_json(), _format_causes(compared, everything=everything)
     else:
-        answer = compare_results(kept, question)
-        written = write_answer(kept, answer, figures)
+        answer = compare_results(folder, question)
+        written = write_answer(folder, answer, figures)
         content, lines = words.summarize_answer(answer), _format_answer(answer, everything=everything)
     page = next((str(path) for name, path in written.items() if name.endswith(".html")), None)
     lines.append(f"page    {page or _NO_PAGE}")
@@ -198,9 +198,9 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.report.datasets_page import write_map  # noqa: PLC0415 - heavy
 
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
-    kept = store.Store(results) if results == Path("results") else open_results(results)
-    drawn = datasets.draw_up_map(kept, deployments, fed=fed, show=show)
-    page = str(write_map(kept, drawn, figures).get("map.html", _NO_PAGE))
+    folder = store.Store(results) if results == Path("results") else open_results(results)
+    drawn = datasets.draw_up_map(folder, deployments, fed=fed, show=show)
+    page = str(write_map(folder, drawn, figures).get("map.html", _NO_PAGE))
     content = {
         "deployments": drawn.points.to_dicts(),
         "datasets": drawn.own.to_dicts(),

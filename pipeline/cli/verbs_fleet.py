@@ -136,9 +136,9 @@ def fit(  # noqa: D417 - the results folder documents itself
     """
     from pipeline.report.datasets_page import write_fleet  # noqa: PLC0415 - heavy
 
-    kept = store.Store(results)
-    fleet = datasets.fit_results(kept)
-    file = str(write_fleet(kept, fleet)["fleet.parquet"])
+    folder = store.Store(results)
+    fleet = datasets.fit_results(folder)
+    file = str(write_fleet(folder, fleet)["fleet.parquet"])
     lines = _format_fleet(fleet, everything=everything)
     return print_result({**fleet.to_json(), "file": file}, lambda: lines, json=json, quiet=quiet)
 
@@ -209,10 +209,10 @@ def trend(  # noqa: D417 - arguments document themselves
     """
     from pipeline.report.datasets_page import write_trend  # noqa: PLC0415 - heavy
 
-    kept = store.Store(results)
+    folder = store.Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
-    followed = datasets.follow_trend(kept, names)
-    page = write_trend(kept, followed).get("trend.html")
+    followed = datasets.follow_trend(folder, names)
+    page = write_trend(folder, followed).get("trend.html")
     content = {**followed.to_json(), "page": None if page is None else str(page)}
     lines = align_rows([(one.group, one.quantity, one.describe()) for one in followed.series])
     lines += [f"! {note}" for note in followed.notes] + ([f"page    {page}"] if page else [])

@@ -156,12 +156,12 @@ def status(  # noqa: D417 - arguments document themselves
     """
     from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
 
-    kept = open_results(results)
+    folder = open_results(results)
     if run is not None:
-        manifest = store.find_run(run, kept)
+        manifest = store.find_run(run, folder)
         content = {"run": manifest.run, "key": manifest.key, **manifest.details}
         return print_result(content, lambda: _format_origin(manifest), json=json)
-    status_now = read_status(kept)
+    status_now = read_status(folder)
     print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
     return FAILED if status_now.errors else CLEAN
 
@@ -225,10 +225,10 @@ def verify(  # noqa: D417 - arguments document themselves
     from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
 
     drawn = parse_sample(sample, seed)
-    kept = open_results(results)
+    folder = open_results(results)
     with show_progress("verify", quiet=quiet or json) as notify:
         verification = verify_results(
-            kept,
+            folder,
             logs=logs,
             notify=notify,
             repair=repair,

@@ -190,7 +190,7 @@ def expect_model(
 
 
 def judge_measured(file: ModelFile, manifests: Sequence[Manifest]) -> ModelFile:
-    """A model fitted to runs on the measured wheels, with AMCL's alphas of each step of its ladder.
+    """A model fitted to runs with their measured wheels as input, and AMCL's alphas of each step.
 
     Args:
         file: the model, as `slip model fit --input measured` would write it.

@@ -66,7 +66,7 @@ Amount = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
 """In SI units; no quantity of a model is larger."""
 
 
-class Promise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Expectation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a file says of a `Question`, which `slip plan --check` compares with the drive."""
 
     question: str
@@ -90,7 +90,7 @@ class StoredPlan(msgspec.Struct, frozen=True):
 
     vehicle: str
     runs: list[str] = []
-    promises: list[Promise] = []
+    promises: list[Expectation] = []
 
 
 def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
@@ -195,7 +195,7 @@ def _format_toml(plan: Plan) -> str:
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
     for one in plan.informative:
-        lines += ["", "[[promises]]", *_format_table(pick(one, *Promise.__struct_fields__))]
+        lines += ["", "[[promises]]", *_format_table(pick(one, *Expectation.__struct_fields__))]
     return "\n".join(lines) + "\n"
 
 
