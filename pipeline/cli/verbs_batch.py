@@ -37,7 +37,7 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, measure_memory
 
 if TYPE_CHECKING:
-    from pipeline.batch.batch_run import Line, Outcome
+    from pipeline.batch.batch_run import Outcome
 
 _MEMORY_SHARE = 0.8
 
@@ -172,14 +172,13 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     lines = format_counts({**outcome.counts, **rare}, width=6)
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    noted = [(_list_notes(line), (line.path, line.reason, line.hint)) for line in outcome.lines]
+    noted = []
+    for line in outcome.lines:
+        # Results that did not change may be of a log with losses, or of one that cannot show slip.
+        notes = {"refused": line.refused, "lossy": line.lossy}
+        also = [name for name, is_so in notes.items() if is_so and name != line.state]
+        noted.append(([line.state, *also], (line.path, line.reason, line.hint)))
     for state in EXPLAINED:
         lines += explain_logs(format_state(state), [row for states, row in noted if state in states])
     copies = [row for states, row in noted if states == ["unchanged"] and row[1]]
     return lines + explain_logs("copies, counted once", copies)
-
-
-def _list_notes(line: Line) -> list[str]:
-    """State of a log, and notes on results that did not change."""
-    notes = {"refused": line.refused, "lossy": line.lossy}
-    return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]

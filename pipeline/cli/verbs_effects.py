@@ -28,7 +28,7 @@ from pipeline.cli.conventions import (
     spell_choices,
     spell_flags,
 )
-from pipeline.core import INPUTS, SlipError, resolve_inside
+from pipeline.core import INPUTS, SlipError, pick, resolve_inside
 
 
 def diagnose(  # noqa: D417 - the shared choices document themselves
@@ -203,26 +203,20 @@ def effects(  # noqa: D417 - the arguments document themselves
     every = (*models.list_effects(), *models.list_own_effects().values())
     chosen = every if effect is None else (models.find_effect(effect),)
     pages = models.list_pages(chosen) if effect is None else [format_effect(chosen[0])]
-    content = {"effects": [_as_json(item) for item in chosen]}
-    return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
-
-
-def _as_json(effect: type[models.Effect]) -> dict[str, object]:
-    from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
-
-    return {
-        "id": effect.id,
-        "place": effect.place.name.lower(),
-        "kinds": list(effect.kinds),
-        "parameters": [
-            {"name": p.name, "unit": p.unit, "about": p.about, "typical": p.typical}
-            for p in effect.parameters
-        ],
-        "needs": [need.value for need in effect.needs],
-        "confused_with": list(effect.confused_with),
-        "equivalent_to": list(effect.equivalent_to),
-        "page": format_effect(effect),
-    }
+    rows = [
+        {
+            "id": one.id,
+            "place": one.place.name.lower(),
+            "kinds": list(one.kinds),
+            "parameters": [pick(number, "name", "unit", "about", "typical") for number in one.parameters],
+            "needs": [need.value for need in one.needs],
+            "confused_with": list(one.confused_with),
+            "equivalent_to": list(one.equivalent_to),
+            "page": format_effect(one),
+        }
+        for one in chosen
+    ]
+    return print_result({"effects": rows}, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
 
 
 _SUFFIXES = {
