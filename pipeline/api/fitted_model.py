@@ -12,8 +12,8 @@ import polars as pl
 from threadpoolctl import threadpool_limits
 
 from pipeline.core import INPUT_WORDS, number_in, objects_in
-from pipeline.datasets import ModelFit, fit_to_runs, read_runs
-from pipeline.estimation import EstimationData, ModelState
+from pipeline.datasets import ModelFit, fit_to_runs, put_on_runs
+from pipeline.estimation import EstimationData, Input, ModelState
 from pipeline.estimation.additions import Tries
 from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import list_parameters
@@ -224,7 +224,7 @@ class Model:
             input: what it is fed with; None as at the last fit, else as the effects need it.
             vehicle_of: whose geometry counts where a run is of another vehicle.
         """
-        file, read = self._read(runs, vehicle_of)
+        file, read = put_on_runs(self.file, _list_manifests(runs), vehicle_of)
         with threadpool_limits(1):
             return Fit(fit_to_runs(file, file, read, input))
 
@@ -241,8 +241,7 @@ class Model:
             Three rows a run: the model as it is, its effects fitted to this run, the ideal model; the columns
             ``run model t_mrmse_m r_mrmse_rad``.
         """
-        file, read = self._read(runs, vehicle_of)
-        source = choose_input(read, input, file.model, last=file.last_input).source
+        file, read, source = self._read(runs, input, vehicle_of)
         with threadpool_limits(1):
             transfers = carry_over(file.model, read, source, per_run=file.per_run)
         rows = []
@@ -275,8 +274,7 @@ class Model:
             A row for each terrain: ``answer`` is ``up_to``, ``every``, ``none`` or ``too_few``, ``speed_mps``
             the highest speed with its interval, beside the range that was driven and the errors at its ends.
         """
-        file, read = self._read(runs, vehicle_of)
-        source = choose_input(read, input, file.model, last=file.last_input).source
+        file, read, source = self._read(runs, input, vehicle_of)
         with threadpool_limits(1):
             return pl.DataFrame(limits_as_json(limit_speeds(file, read, source, within_m, ahead_s)))
 
@@ -365,8 +363,7 @@ class Model:
         self, run: StoredRun, input: Source | None, owner: Owner | None
     ) -> tuple[EstimationData, ModelState]:
         """The run as estimation data, and the model on it: its values as they are, the run's own delays."""
-        file, read = self._read(run, owner)
-        source = choose_input(read, input, file.model, last=file.last_input).source
+        file, read, source = self._read(run, input, owner)
         data = EstimationData(read, file.model.vehicle, source)
         with threadpool_limits(1):
             return data, fit_as_it_is(data, file.model, file.per_run).state
@@ -389,10 +386,10 @@ class Model:
         return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)
 
     def _read(
-        self, runs: StoredRun | Sequence[StoredRun], owner: Owner | None
-    ) -> tuple[ModelFile, list[MotionRun]]:
-        vehicle, read = read_runs(_list_manifests(runs), self.file.model.vehicle, owner)
-        return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
+        self, runs: StoredRun | Sequence[StoredRun], input: Source | None, owner: Owner | None
+    ) -> tuple[ModelFile, list[MotionRun], Input]:
+        file, read = put_on_runs(self.file, _list_manifests(runs), owner)
+        return file, read, choose_input(read, input, file.model, last=file.last_input).source
 
     def __repr__(self) -> str:
         numbers = format_parameters(list_parameters(self.file))

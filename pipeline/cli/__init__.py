@@ -6,6 +6,7 @@ the program, its verbs by task, and what errors become.
 
 import gc
 import importlib
+import json
 import os
 import sys
 from collections.abc import Sequence
@@ -26,13 +27,13 @@ from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     USAGE,
-    MemoryLimit,
-    limited_memory,
+    Answer,
+    is_json,
     print_error,
     print_lines,
-    refuse_json,
+    summarize_error,
 )
-from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
+from pipeline.core import SlipError, keep_current_folder_out, limit_memory, read_version, silence_warnings
 
 HELP = """How far was the motion from the ideal model, and why?
 
@@ -143,12 +144,20 @@ def _build_launcher(app: App, words: Sequence[str]) -> App:
             ),
         ] = None,
     ) -> object:
-        limit = MemoryLimit(memory, conclude=partial(refuse_json, words))
+        answer = Answer(memory, is_json(words))
         command, bound, injected = app.parse_args(tokens, exit_on_error=False)
-        with limited_memory(limit):
-            return command(*bound.args, **bound.kwargs, **dict.fromkeys(injected, limit))
+        with limit_memory(answer.limit_bytes, answer.end):
+            return command(*bound.args, **bound.kwargs, **dict.fromkeys(injected, answer))
 
     return app.meta
+
+
+def _refuse_json(words: Sequence[str], error: SlipError) -> None:
+    """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
+    if is_json(words):
+        content = {"runs": [], "errors": [summarize_error(error.where, error)]}
+        # One line: those who read `watch` read line by line.
+        sys.stdout.write(json.dumps(content) + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -171,11 +180,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     except CycloptsError as error:
         chain = " ".join(error.command_chain or ())
-        refuse_json(words, SlipError("usage", str(error).rstrip("."), hint=f"See slip {chain} --help"))
+        _refuse_json(words, SlipError("usage", str(error).rstrip("."), hint=f"See slip {chain} --help"))
         sys.exit(USAGE)
     except SlipError as error:
         print_error(error)
-        refuse_json(words, error)
+        _refuse_json(words, error)
         sys.exit(FAILED)
     except BrokenPipeError:
         # The reader of the pipe has exited (`slip ... | head`): no output is possible.

@@ -11,21 +11,21 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import store
 from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.batch import parse_memory_limit, parse_size
-from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, limit_memory, measure_memory, shorten
+from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, measure_memory, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
-    from pipeline.store import Store
 
 CLEAN = 0
 FAILED = 1
@@ -64,16 +64,14 @@ def _spell_out(character: str) -> str:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower."""
-    width = _measure_screen()
+    """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower.
+
+    The screen is as wide as COLUMNS says, else as the terminal; a file is not folded.
+    """
+    columns = os.environ.get("COLUMNS", "")
+    seen = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    width = (int(columns) if columns.isdecimal() else 0) or seen
     sys.stdout.write("".join(f"{part}\n" for line in lines for part in fold_line(tidy_line(line), width)))
-
-
-def _measure_screen() -> int:
-    """Columns of the terminal, or COLUMNS if set; 0 (no folding) if the output is not a terminal."""
-    width = os.environ.get("COLUMNS", "")
-    seen = int(width) if width.isdecimal() else 0
-    return seen or (shutil.get_terminal_size().columns if sys.stdout.isatty() else 0)
 
 
 def fold_line(line: str, width: int) -> list[str]:
@@ -183,12 +181,6 @@ def print_note(text: str) -> None:
     sys.stderr.flush()
 
 
-def print_warnings(texts: Iterable[str]) -> None:
-    """Print warnings on standard error, a line each."""
-    for text in texts:
-        print_note(f"slip: {text}")
-
-
 @contextmanager
 def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]:
     """Tell on stderr what is being done: a spinner on a terminal, plain lines otherwise."""
@@ -211,62 +203,69 @@ _SHARE = 0.8
 
 
 @dataclass
-class MemoryLimit:
-    """The memory limit of a command, and what it says when it ends for it.
+class Answer:
+    """What a command answers on logs, also where it ends for its memory limit.
 
     Attributes:
-        given: the limit as it was typed, for example 2GB; None for a share of the machine's memory.
+        memory: the limit as it was typed, for example 2GB; None for a share of the machine's memory.
+        is_json: whether it is asked for as one JSON object.
         at_work: which file is being worked on.
-        conclude: prints the error, and the results so far, as JSON, where that was asked for.
+        list_runs: the runs so far as JSON objects.
+        errors: errors as JSON objects; each affects only one log.
     """
 
-    given: str | None = None
+    memory: str | None
+    is_json: bool
     at_work: str = ""
-    conclude: Callable[[SlipError], None] | None = None
+    list_runs: Callable[[], Sequence[object]] = list
+    errors: list[dict[str, str]] = field(default_factory=list)
 
     @property
     def limit_bytes(self) -> int:
-        """The limit of the process [bytes].
+        """The memory limit of the process [bytes].
 
         Raises:
             BatchError: ``bad_size``, ``memory_too_small``.
         """
-        return int(_SHARE * measure_memory()) if self.given is None else parse_memory_limit(self.given)
+        return int(_SHARE * measure_memory()) if self.memory is None else parse_memory_limit(self.memory)
+
+    @contextmanager
+    def attempt(self, log: str) -> Iterator[None]:
+        """Work on a log, or another file: its error is printed, and the others go on."""
+        self.at_work = log
+        try:
+            yield
+        except SlipError as error:
+            self._note(log, error)
+
+    def to_json(self) -> dict[str, object]:
+        """Runs and errors as one JSON object."""
+        return {"runs": self.list_runs(), "errors": self.errors}
 
     def end(self, held: int) -> None:
         """End the process with one line; what it has written stays as it was, as after a kill."""
         what = f"the command used {held / 1e9:.2g} GB of memory, more than {self.limit_bytes / 1e9:.2g} GB"
         hint = "Give it more with --memory, or leave out what is that large"
-        error = SlipError("out_of_memory", what, where=self.at_work, hint=hint)
-        print_error(error)
-        if self.conclude is not None:
-            self.conclude(error)
+        self._note(self.at_work, SlipError("out_of_memory", what, where=self.at_work, hint=hint))
+        if self.is_json:
+            # One line: those who read `watch` read line by line.
+            sys.stdout.write(json.dumps(self.to_json()) + "\n")
         sys.stdout.flush()
         # Only this ends a library's computation.
         os._exit(FAILED)
 
-
-Limit: TypeAlias = Annotated[MemoryLimit, Parameter(parse=False)]
-"""The memory limit of the command, given by `main` to the verbs that say more at their end."""
-
-
-@contextmanager
-def limited_memory(limit: MemoryLimit) -> Iterator[None]:
-    """Hold a command to its memory limit.
-
-    Raises:
-        BatchError: ``bad_size``, ``memory_too_small``.
-    """
-    with limit_memory(limit.limit_bytes, limit.end):
-        yield
+    def _note(self, log: str, error: SlipError) -> None:
+        print_error(error)
+        self.errors.append(summarize_error(log, error))
 
 
-def refuse_json(words: Sequence[str], error: SlipError) -> None:
-    """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
-    if "--json" in itertools.takewhile(lambda word: word != "--", words):
-        content = {"runs": [], "errors": [summarize_error(error.where, error)]}
-        # One line: those who read `watch` read line by line.
-        sys.stdout.write(json.dumps(content) + "\n")
+Asked: TypeAlias = Annotated[Answer, Parameter(parse=False)]
+"""The answer of the command, given by `main` to the verbs that say more at their end."""
+
+
+def is_json(words: Sequence[str]) -> bool:
+    """Whether these words of a command ask for one JSON object."""
+    return "--json" in itertools.takewhile(lambda word: word != "--", words)
 
 
 def _require_local(_kind: object, results: Path) -> None:
@@ -326,11 +325,24 @@ def build_options(choices: Choices) -> Options:
     Raises:
         BatchError: ``bad_size``.
     """
+    said: dict[str, dict[str, object]] = {
+        "vehicle": {
+            "preset": choices.vehicle,
+            "wheel_radius_m": choices.wheel_radius,
+            "track_width_m": choices.track_width,
+        },
+        "run": {"dataset": choices.dataset, "terrain": choices.terrain},
+        "velocity": {"yaw": choices.yaw},
+    }
+    given = {section: {k: v for k, v in values.items() if v is not None} for section, values in said.items()}
+    overrides: dict[str, object] = {section: values for section, values in given.items() if values}
+    if choices.interval == "all":
+        overrides["use_intervals"] = "all"
     return Options(
         max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
         out=choices.results,
         config=choices.config,
-        overrides=_list_overrides(choices),
+        overrides=overrides,
         inputs=INPUTS if choices.input == "both" else (choices.input,),
         report=False,
     )
@@ -348,38 +360,15 @@ def spell_flags(values: Mapping[str, object]) -> str:
     return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in said.items())
 
 
-def _list_overrides(choices: Choices) -> Mapping[str, object]:
-    """Configuration values from the command line."""
-    said: dict[str, dict[str, object]] = {
-        "vehicle": {
-            "preset": choices.vehicle,
-            "wheel_radius_m": choices.wheel_radius,
-            "track_width_m": choices.track_width,
-        },
-        "run": {"dataset": choices.dataset, "terrain": choices.terrain},
-        "velocity": {"yaw": choices.yaw},
-    }
-    given_again: dict[str, object] = {}
-    for section, values in said.items():
-        given = {key: value for key, value in values.items() if value is not None}
-        if given:
-            given_again[section] = given
-    if choices.interval == "all":
-        given_again["use_intervals"] = "all"
-    return given_again
-
-
-def open_results(results: Path) -> Store:
+def open_results(results: Path) -> store.Store:
     """The results in a folder.
 
     Raises:
         StoreError: ``no_results``, there is no such folder.
     """
-    from pipeline.store import Store, no_results  # noqa: PLC0415 - verbs that only help need none
-
     if not results.is_dir():
-        raise no_results(results)
-    return Store(results)
+        raise store.no_results(results)
+    return store.Store(results)
 
 
 def format_vehicle_source(source: str) -> str:
@@ -395,16 +384,13 @@ OwnEffects = Annotated[
 
 
 @contextmanager
-def open_shown(
-    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = print_note
-) -> Iterator[OpenedRun]:
-    """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
+def open_shown(name: str, options: Options, *, quiet: bool) -> Iterator[OpenedRun]:
+    """A run as `open_run` gives it; its progress is shown, and its note said."""
     from pipeline.analysis.analyze import open_run  # noqa: PLC0415 - heavy
 
-    with (
-        show_progress(Path(name).name, quiet=quiet) as progress,
-        open_run(name, options, progress) as opened,
-    ):
+    with ExitStack() as stack:
+        with show_progress(Path(name).name, quiet=quiet) as progress:
+            opened = stack.enter_context(open_run(name, options, progress))
+        if opened.note and not quiet:
+            print_note(f"slip: {opened.note}")
         yield opened
-    if opened.note and not quiet:
-        notify(f"slip: {opened.note}")

@@ -6,9 +6,10 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from pipeline import words
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
@@ -27,9 +28,10 @@ from pipeline.core import (
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, has_no_pose, read_findings, read_result
+from pipeline.words.diagnosis import list_lines
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
 
     from pipeline.batch.batch_run import Line
 
@@ -43,24 +45,17 @@ class SilentWatch:
     def notify(self, line: Line, size: int) -> None:
         """Ignored."""
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        return None
-
-
-class LineWatch(SilentWatch):
+class LineWatch:
     """One line a log on stderr."""
 
     def __init__(self) -> None:
         self._started = time.monotonic()
-        self._todo = self._done = 0
-        self._size = self._read = 0
+        self._todo = self._done = self._size = self._read = 0
 
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
-        self._begin(todo, size)
+        self._started, self._todo, self._size = time.monotonic(), todo, size
         print_note(f"{format_count(todo, 'log')} to work on ({format_size(size)}), {settled} already done")
 
     def notify(self, line: Line, size: int) -> None:
@@ -73,63 +68,44 @@ class LineWatch(SilentWatch):
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){remaining}"
         )
 
-    def _begin(self, todo: int, size: int) -> None:
-        self._todo, self._size = todo, size
-        self._started = time.monotonic()
-
     def estimate_rest(self) -> float:
         """Seconds that the rest takes if a byte of it, or else a log, takes as long as those before."""
         share = self._read / self._size if self._read else self._done / self._todo
         return (time.monotonic() - self._started) * (1.0 - share) / share
 
 
-class BarWatch(LineWatch):
+class BarWatch:
     """A bar on a terminal; only what went wrong gets a line."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn  # noqa: PLC0415
-        from rich.progress import Progress as Bar  # noqa: PLC0415
-
-        columns = (
-            "{task.description}",
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[remaining]}"),
-        )
-        self._bar: Progress = Bar(*columns, console=Console(stderr=True))
-        self._task: TaskID | None = None
+    def __init__(self, bar: Progress) -> None:
+        self._bar, self._task = bar, bar.add_task("logs", total=None)
 
     def plan(self, todo: int, settled: int, size: int) -> None:
-        """Show the bar."""
-        self._begin(todo, size)
-        del settled
-        self._task = self._bar.add_task("logs", total=todo, remaining="")
-        self._bar.start()
+        """Show how much there is to do."""
+        del settled, size
+        self._bar.update(self._task, total=todo)
 
     def notify(self, line: Line, size: int) -> None:
         """Move the bar on."""
-        self._done += 1
-        self._read += size
+        del size
         if line.reason:
             text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
-        if self._task is not None:
-            remaining = (
-                f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
-            )
-            self._bar.update(self._task, advance=1, remaining=remaining)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        self._bar.advance(self._task)
 
 
-def open_watch(*, quiet: bool) -> SilentWatch:
+@contextmanager
+def open_watch(*, quiet: bool) -> Iterator[SilentWatch | LineWatch | BarWatch]:
     """Whoever fits the place: nobody, a bar, or lines."""
-    if quiet:
-        return SilentWatch()
-    return BarWatch() if sys.stderr.isatty() else LineWatch()
+    if quiet or not sys.stderr.isatty():
+        yield SilentWatch() if quiet else LineWatch()
+        return
+    from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
+    from rich.progress import MofNCompleteColumn, Progress  # noqa: PLC0415 - likewise
+
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        yield BarWatch(bar)
 
 
 Summary = Mapping[str, object]
@@ -154,13 +130,18 @@ def format_run(
     verdict = str(summary.get("verdict") or "")
     head, first = _format_head(summary), [verdict] if verdict else []
     is_excluded = RunReport(summary).refusal
+    # Those of the run and of its diagnosis that need attention, except what the verdict says.
+    findings = read_findings(summary)
+    known = {finding.text for finding in findings}
+    own = read_findings(mapping_in(summary, "diagnosis"))
+    every = [*findings, *(one for one in own if one.text not in known)]
     # If the data are invalid, this is stated first.
     lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
         *([] if is_excluded and not everything else _format_slip(summary, everything=everything)),
         *(_format_topics(summary) if everything else []),
         *_format_diagnosis(summary, everything=everything),
-        *_format_findings(summary, verdict, everything=everything),
+        *(_row(*row) for row in words.list_findings({"": every}, verdict, everything=everything)),
         *([_row("same", f"content as {twin}: counted once, under that name")] if twin else []),
         *_format_end(summary, said, unchanged=unchanged),
     ]
@@ -186,8 +167,9 @@ def _format_head(summary: Summary) -> list[str]:
     log = mapping_in(summary, "log")
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
+    named = [(key, str(summary[key])) for key in ("vehicle", "terrain")]
     facts = [
-        *(_name_known(summary, key) for key in ("vehicle", "terrain")),
+        *(f"{key} unknown" if name == "unknown" else name for key, name in named),
         format_recorded(seconds, summary.get("duration_s")),
     ]
     if isinstance(distance, (int, float)):
@@ -199,27 +181,16 @@ def _format_head(summary: Summary) -> list[str]:
     # The verdict states an error without the mark of a finding.
     errors = count_serious(objects_in(summary, "findings")).get("error")
     state += f", {errors}" if errors else ""
-    holes = _format_gaps(gaps[0]) if gaps else ""
-    head = [f"{summary['run']}    {' · '.join(facts)}    {state}{holes}"]
-    return head + [_row("lost", _format_loss(loss)) for loss in losses[:_SHOWN]]
-
-
-def _name_known(summary: Summary, key: str) -> str:
-    """The vehicle or the terrain of a run; `terrain unknown` where the log does not say it."""
-    name = str(summary[key])
-    return f"{key} unknown" if name == "unknown" else name
-
-
-def _format_loss(loss: Mapping[str, object]) -> str:
-    start, end = loss.get("start_s"), loss.get("end_s")
-    known = isinstance(start, (int, float)) and isinstance(end, (int, float))
-    return f"{loss['text']}" + (f" ({start:.1f} to {end:.1f} s of the log)" if known else "")
-
-
-def _format_gaps(gaps: Mapping[str, object]) -> str:
-    count, longest = cast("int", gaps["count"]), number_in(gaps, "value")
-    how_long = "" if longest is None else f" (longest {longest:.2g} s)"
-    return f", {count} gap{'s' if count != 1 else ''} in the poses{how_long}"
+    if gaps:
+        count, longest = cast("int", gaps[0]["count"]), number_in(gaps[0], "value")
+        how_long = "" if longest is None else f" (longest {longest:.2g} s)"
+        state += f", {count} gap{'s' if count != 1 else ''} in the poses{how_long}"
+    head = [f"{summary['run']}    {' · '.join(facts)}    {state}"]
+    for loss in losses[:_SHOWN]:
+        start, end = number_in(loss, "start_s"), number_in(loss, "end_s")
+        span = "" if start is None or end is None else f" ({start:.1f} to {end:.1f} s of the log)"
+        head.append(_row("lost", f"{loss['text']}{span}"))
+    return head
 
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
@@ -283,20 +254,8 @@ def _format_topics(summary: Summary) -> list[str]:
     return lines
 
 
-def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
-    """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
-    findings = read_findings(summary)
-    known = {finding.text for finding in findings}
-    own = [one for one in read_findings(mapping_in(summary, "diagnosis")) if one.text not in known]
-    return [
-        _row(*row) for row in words.list_findings({"": [*findings, *own]}, verdict, everything=everything)
-    ]
-
-
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
-    from pipeline.words.diagnosis import list_lines  # noqa: PLC0415 - heavy
-
     stored = mapping_in(summary, "diagnosis")
     if not stored:
         return []

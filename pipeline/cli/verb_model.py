@@ -10,40 +10,28 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline import datasets, models, words
+from pipeline import datasets, estimation, models, sources, store, words
 from pipeline.cli.conventions import (
     CLEAN,
     OwnEffects,
     Results,
-    print_json,
     print_lines,
-    print_result,
-    print_warnings,
 )
 from pipeline.cli.model_runs import (
     Against,
     On,
     Spoken,
     compare_rivals,
-    cut_first,
-    expect_model,
-    gather_runs,
-    judge_measured,
     literature,
     new_effect,
     open_model,
-    prior_as_json,
     read_metres,
     read_seconds,
-    require_model,
-    require_models,
-    tie_to_fleet,
 )
-from pipeline.core import INPUT_WORDS
+from pipeline.core import INPUT_WORDS, SlipError
 
 if TYPE_CHECKING:
     from pipeline.estimation.transfer import Transfer
-    from pipeline.run import MotionRun
 
 
 def build_model() -> App:
@@ -75,14 +63,11 @@ def new(  # noqa: D417 - the shared option documents itself
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.run import MotionError  # noqa: PLC0415
-    from pipeline.sources import VehicleSection, resolve_vehicle  # noqa: PLC0415 - heavy
-
     if model.exists() and not force:
-        raise MotionError(
-            "model_exists", "the file already exists", where=str(model), hint="Give --force to replace it."
-        )
-    chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
+        what, hint = "the file already exists", "Give --force to replace it."
+        raise SlipError("model_exists", what, where=str(model), hint=hint)
+    section = sources.VehicleSection(preset=vehicle)
+    chosen = sources.resolve_vehicle(section, recorded=None, where=str(model))
     made = models.find_model(template or "ideal").make(chosen)
     models.load_effects(effects or ())
     for name in ids:
@@ -183,10 +168,12 @@ def fit(  # noqa: D417 - the shared options document themselves
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
         models.load_effects(spoken.effects or ())
-        quiet = spoken.quiet or spoken.json
-        file = expect_model(spoken.on, spoken.input, spoken.results, quiet=quiet)
+        file = datasets.expect_model(spoken.open(), spoken.input, store.Store(spoken.results))
+    elif model is None:
+        hint = "Give one, or use the fleet's prior: --prior fleet."
+        raise SlipError("no_model", "no model file was given", where="slip model fit", hint=hint)
     else:
-        file = open_model(require_model(model), spoken.effects)
+        file = open_model(model, spoken.effects)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
@@ -206,48 +193,39 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file; with --against it may be left out.
         other: another one.
     """
-    from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
-
     paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
-    if against is None:
-        require_models(model, other)
+    if against is None and (model is None or other is None):
+        hint = "Give two, or compare with others: --against literature."
+        raise SlipError("no_model", "two model files are compared", where="slip model compare", hint=hint)
     opened = [open_model(path, spoken.effects) for path in paths]
     if against is not None:
         return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken)
-    files = [_gather(spoken, file, spoken.on) for file in opened]
+    manifests = spoken.open()
+    files = [datasets.put_on_runs(file, manifests, spoken.vehicle_of) for file in opened]
     # Both models use the same input, so that their errors are comparable.
     last = {file.last_input for file, _ in files}
     effects = [effect for file, _ in files for effect in file.model]
-    chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
+    only = last.pop() if len(last) == 1 else None
+    chosen = estimation.choose_input(files[0][1], spoken.input, effects, last=only)
     rows: list[tuple[str, Transfer]] = []
-    own_runs: list[str] = []
+    warnings = [chosen.warning]
     for path, (file, runs) in zip(paths, files, strict=True):
         own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in runs}
         seen = "its error there is not a held-out error"
-        own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
-        carried = carry_over(
-            file.model,
-            runs,
-            chosen.source,
-            fitted_on=[str(run.get("terrain")) for run in file.list_fitted("runs")],
-            per_run=file.per_run,
+        warnings += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
+        fitted_on = [str(run.get("terrain")) for run in file.list_fitted("runs")]
+        carried = estimation.carry_over(
+            file.model, runs, chosen.source, fitted_on=fitted_on, per_run=file.per_run
         )
         rows += [(str(path), item) for item in carried]
-    warnings = [text for text in (chosen.warning, *own_runs, *(item.warning for _, item in rows)) if text]
-    if spoken.json:
-        print_json(
-            {
-                "input": chosen.source.value,
-                "input_reason": chosen.reason,
-                "compared": [_transfer_as_json(name, item) for name, item in rows],
-                "warnings": warnings,
-            }
-        )
-    elif not spoken.quiet:
-        print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
-        print_warnings(warnings)
-    return CLEAN
+    content = {
+        "input": chosen.source.value,
+        "input_reason": chosen.reason,
+        "compared": [_transfer_as_json(name, item) for name, item in rows],
+    }
+    fed = f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})"
+    warnings += [item.warning for _, item in rows]
+    return spoken.print(content, lambda: [fed, *_format_transfers(rows)], [*filter(None, warnings)])
 
 
 def speed(  # noqa: D417 - the shared options document themselves
@@ -263,29 +241,24 @@ def speed(  # noqa: D417 - the shared options document themselves
         within: largest error of the predicted position, for example 10cm.
         ahead: how far ahead, up to 2s.
     """
-    from pipeline.estimation.run_residuals import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415
+    from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415 - heavy
 
     tolerance_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
     opened = open_model(model, spoken.effects)
-    file, runs = _gather(spoken, opened, spoken.on)
-    chosen = choose_input(runs, spoken.input, file.model, last=file.last_input)
+    file, runs = datasets.put_on_runs(opened, spoken.open(), spoken.vehicle_of)
+    chosen = estimation.choose_input(runs, spoken.input, file.model, last=file.last_input)
     limits = limit_speeds(file, runs, chosen.source, tolerance_m, ahead_s)
-    warnings = [chosen.warning] if chosen.warning else []
     content = {
         "within_m": tolerance_m,
         "ahead_s": ahead_s,
         "input": chosen.source.value,
         "terrains": limits_as_json(limits),
-        "warnings": warnings,
     }
-    if not spoken.json:
-        print_warnings(warnings)
     lines = [
         f"{INPUT_WORDS[chosen.source.value]} of {', '.join(run.name for run in runs)} ({chosen.reason})",
         *words.format_speed_limits(limits, tolerance_m, ahead_s),
     ]
-    return print_result(content, lambda: lines, json=spoken.json, quiet=spoken.quiet)
+    return spoken.print(content, lambda: lines, [*filter(None, [chosen.warning])])
 
 
 def export(  # noqa: D417 - the options document themselves
@@ -319,11 +292,14 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
-    from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
+    from pipeline.export import export_model, read_current, require_errors  # noqa: PLC0415 - heavy
 
     used = None if current is None else read_current(current, to)
     opened = open_model(model, effects)
-    text = export_model(judge_measured(opened, to, on, results) if on else opened, to, used, gate)
+    if on:
+        require_errors(to)
+        opened = datasets.judge_measured(opened, On(on=on, results=results).open())
+    text = export_model(opened, to, used, gate)
     if file is None:
         sys.stdout.write(text)
     else:
@@ -345,67 +321,36 @@ def _change(
     """Evaluate a model before and after a change, fit it, write its file, and print.
 
     Raises:
-        MotionError: ``no_help``, with ``must_help``: the file is unchanged.
+        SlipError: ``no_help``, with ``must_help``: the file is unchanged.
     """
-    from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
-
-    after, gathered = _gather(spoken, after, [*spoken.on, *predict])
+    after, gathered = datasets.put_on_runs(after, spoken.open(*predict), spoken.vehicle_of)
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
-    model = after.model
-    fit = datasets.fit_to_runs(
-        before,
-        after,
-        runs if first_s is None else cut_first(runs, first_s),
-        spoken.input,
-        None if prior is None else lambda data: tie_to_fleet(data, model, spoken.results),
-    )
+    fleet = None if prior is None else store.Store(spoken.results)
+    fit = datasets.fit_to_runs(before, after, runs, spoken.input, first_s=first_s, fleet=fleet)
     refusals = fit.explain_refusals()
     if must_help and refusals:
-        _require_help(str(path), fit, refusals)
-    said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
-    written = replace(fit.file, fit={**fit.file.fit, **said})
+        added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
+        hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
+        what = f"{words.format_refusals(refusals)}: the model is unchanged"
+        raise SlipError("no_help", what, where=str(path), hint=f"{hint}, or give --anyway")
     if path is not None:
-        models.write_model(written, path)
-    terrains = [run.terrain for run in runs]
-    provenance = {"fitted_on": terrains, "per_run": written.per_run}
-    carried = carry_over(written.model, others, fit.chosen.source, **provenance) if others else []
-    warnings = [text for text in (fit.chosen.warning, *(item.warning for item in carried)) if text]
-    if spoken.json:
-        print_json(
-            {
-                "model": None if path is None else str(path),
-                **fit.to_json(),
-                "prior": prior_as_json(fit.after.data),
-                "carried_over": [_transfer_as_json(str(path), item) for item in carried],
-                "warnings": warnings,
-            }
-        )
-    elif not spoken.quiet:
+        models.write_model(fit.file, path)
+    provenance = {"fitted_on": [run.terrain for run in runs], "per_run": fit.file.per_run}
+    carried = estimation.carry_over(fit.file.model, others, fit.chosen.source, **provenance) if others else []
+    content = {
+        "model": None if path is None else str(path),
+        **fit.to_json(),
+        "prior": fit.prior_as_json(),
+        "carried_over": [_transfer_as_json(str(path), item) for item in carried],
+    }
+
+    def format_lines() -> list[str]:
         lines = _format_change(fit, refusals)
         lines += [] if path is None else [f"written: {path}"]
-        if carried:
-            lines += ["", *_format_transfers([(str(path), item) for item in carried])]
-        print_lines(lines)
-        print_warnings(warnings)
-    return CLEAN
+        return lines + (["", *_format_transfers([(str(path), item) for item in carried])] if carried else [])
 
-
-def _require_help(path: str, fit: datasets.ModelFit, refusals: Mapping[str, str]) -> None:
-    from pipeline.run import MotionError  # noqa: PLC0415
-
-    added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
-    hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
-    what = f"{words.format_refusals(refusals)}: the model is unchanged"
-    raise MotionError("no_help", what, where=path, hint=f"{hint}, or give --anyway")
-
-
-def _gather(
-    spoken: On, file: models.ModelFile, names: Sequence[str]
-) -> tuple[models.ModelFile, list[MotionRun]]:
-    """The file with the vehicle whose geometry is used, and the runs."""
-    quiet = spoken.quiet or spoken.json
-    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.results, quiet=quiet)
-    return replace(file, model=replace(file.model, vehicle=vehicle)), runs
+    warnings = [text for text in (fit.chosen.warning, *(item.warning for item in carried)) if text]
+    return spoken.print(content, format_lines, warnings)
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
@@ -440,7 +385,7 @@ def _format_change(fit: datasets.ModelFit, refusals: Mapping[str, str]) -> list[
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = parameters_as_json(new.fitted.model, new.estimates)
-    prior = prior_as_json(new.data)
+    prior = fit.prior_as_json()
     lines += ["", "parameters", *words.format_parameters(parameters)]
     return [*lines, "", "prior", *words.format_parameters(prior)] if prior else lines
 

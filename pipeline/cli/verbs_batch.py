@@ -22,8 +22,8 @@ from pipeline.cli.conventions import (
     EXPLAINED,
     FAILED,
     LOSSY,
+    Asked,
     Choices,
-    Limit,
     build_options,
     explain_logs,
     format_counts,
@@ -37,7 +37,7 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, measure_memory
 
 if TYPE_CHECKING:
-    from pipeline.batch.batch_run import Line, Outcome
+    from pipeline.batch.batch_run import Outcome
 
 _MEMORY_SHARE = 0.8
 
@@ -59,7 +59,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     force: bool = False,
     retry_quarantined: bool = False,
     timeout: PositiveFloat = 3600.0,
-    limit: Limit,
+    asked: Asked,
     settle: NonNegativeFloat = 120.0,
     prune: bool = False,
     keep: NonNegativeInt = 1,
@@ -109,8 +109,8 @@ def batch(  # noqa: D417 - the shared choices document themselves
         shard=None if shard is None else parse_shard(shard),
         timeout_s=timeout,
         memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
-        if limit.given is None
-        else limit.limit_bytes,
+        if asked.memory is None
+        else asked.limit_bytes,
         settle_s=settle,
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,
@@ -172,14 +172,13 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     lines = format_counts({**outcome.counts, **rare}, width=6)
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    noted = [(_list_notes(line), (line.path, line.reason, line.hint)) for line in outcome.lines]
+    noted = []
+    for line in outcome.lines:
+        # Results that did not change may be of a log with losses, or of one that cannot show slip.
+        notes = {"refused": line.refused, "lossy": line.lossy}
+        also = [name for name, is_so in notes.items() if is_so and name != line.state]
+        noted.append(([line.state, *also], (line.path, line.reason, line.hint)))
     for state in EXPLAINED:
         lines += explain_logs(format_state(state), [row for states, row in noted if state in states])
     copies = [row for states, row in noted if states == ["unchanged"] and row[1]]
     return lines + explain_logs("copies, counted once", copies)
-
-
-def _list_notes(line: Line) -> list[str]:
-    """State of a log, and notes on results that did not change."""
-    notes = {"refused": line.refused, "lossy": line.lossy}
-    return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]

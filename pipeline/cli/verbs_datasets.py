@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline import datasets, words
+from pipeline import datasets, store, words
 from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
 from pipeline.core import (
     INPUT_WORDS,
@@ -69,7 +69,6 @@ def compare(  # noqa: D417 - arguments document themselves
     """
     from pipeline.datasets import Question, compare_results, find_causes  # noqa: PLC0415 - heavy
     from pipeline.report.datasets_page import write_answer, write_causes  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     # Alone or before datasets, a folder is that of the results.
     is_folder = len(datasets) == 1 or (datasets and Path(datasets[0]).is_dir())
@@ -77,14 +76,14 @@ def compare(  # noqa: D417 - arguments document themselves
         results, datasets = Path(datasets[0]), datasets[1:]
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
-    store = Store(results)
+    folder = store.Store(results)
     if causes:
-        compared = find_causes(store, question)
-        written = write_causes(store, compared, figures)
+        compared = find_causes(folder, question)
+        written = write_causes(folder, compared, figures)
         content, lines = compared.to_json(), _format_causes(compared, everything=everything)
     else:
-        answer = compare_results(store, question)
-        written = write_answer(store, answer, figures)
+        answer = compare_results(folder, question)
+        written = write_answer(folder, answer, figures)
         content, lines = words.summarize_answer(answer), _format_answer(answer, everything=everything)
     page = next((str(path) for name, path in written.items() if name.endswith(".html")), None)
     lines.append(f"page    {page or _NO_PAGE}")
@@ -197,12 +196,11 @@ def draw(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     from pipeline.report.datasets_page import write_map  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
-    store = Store(results) if results == Path("results") else open_results(results)
-    drawn = datasets.draw_up_map(store, deployments, fed=fed, show=show)
-    page = str(write_map(store, drawn, figures).get("map.html", _NO_PAGE))
+    folder = store.Store(results) if results == Path("results") else open_results(results)
+    drawn = datasets.draw_up_map(folder, deployments, fed=fed, show=show)
+    page = str(write_map(folder, drawn, figures).get("map.html", _NO_PAGE))
     content = {
         "deployments": drawn.points.to_dicts(),
         "datasets": drawn.own.to_dicts(),

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline import estimation, sources
+from pipeline import estimation, models, sources, store
+from pipeline import plan as planning
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
@@ -30,10 +31,8 @@ from pipeline.core import SlipError, align_rows, format_count, format_duration
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
-    from pipeline.plan import Plan
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
-    from pipeline.store import Manifest
 
 
 def plan(  # noqa: D417 - the runs document themselves
@@ -80,12 +79,15 @@ def plan(  # noqa: D417 - the runs document themselves
     names = list(runs or [])
     if check is not None:
         return _check(check, names, options, said, json=json, quiet=quiet)
-    from pipeline import plan as planning  # noqa: PLC0415 - heavy
     from pipeline.report.drive_pages import write_drive  # noqa: PLC0415 - heavy
 
     seconds = planning.parse_time(time)
     gathered = _gather(names, options, quiet=quiet or json) if names else None
-    chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
+    chosen = sources.find_preset(vehicle or "") if gathered is None else gathered.vehicle
+    if chosen is None:
+        known = ", ".join(preset.id for preset in sources.list_presets())
+        what = f"no preset is called {vehicle!r}" if vehicle else "a plan needs a run or a vehicle"
+        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
     # Report wrong options before a long diagnosis.
     ground = planning.parse_area(area, chosen)
     with show_progress(at_work, quiet=quiet or json) as progress:
@@ -113,15 +115,14 @@ def plan(  # noqa: D417 - the runs document themselves
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
 
-def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) -> list[str]:
+def _show_in_report(results: Path, manifests: Sequence[store.Manifest], made: planning.Plan) -> list[str]:
     """Store the plan with its run, if it is for one stored run, and name the report that shows it."""
     from pipeline.report.drive_pages import leave_plan  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if len(manifests) != 1:
         return []
     try:
-        shown = leave_plan(Store(results), manifests[0], made)
+        shown = leave_plan(store.Store(results), manifests[0], made)
     except (SlipError, OSError) as error:
         print_note(f"slip: the report of the run does not show the plan: {error}")
         return []
@@ -133,7 +134,7 @@ class _Gathered(NamedTuple):
 
     vehicle: sources.Vehicle
     recordings: list[estimation.Recording]
-    manifests: list[Manifest]
+    manifests: list[store.Manifest]
     lossy: bool
 
 
@@ -165,20 +166,9 @@ def _gather(
     return _Gathered(vehicles[0], recordings, manifests, lossy)
 
 
-def _find_vehicle(name: str | None) -> sources.Vehicle:
-    vehicle = None if name is None else sources.find_preset(name)
-    if vehicle is None:
-        known = ", ".join(preset.id for preset in sources.list_presets())
-        what = "a plan needs a run or a vehicle" if name is None else f"no preset is called {name!r}"
-        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
-    return vehicle
-
-
 def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
     """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
-    from pipeline.plan import check_plan, read_plan, require_played  # noqa: PLC0415 - heavy
-
-    stored = read_plan(path)
+    stored = planning.read_plan(path)
     if not names:
         what = "a check needs the log that was driven"
         raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
@@ -193,9 +183,9 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
         driven = [estimation.load_recording(recording, vehicle) for recording in drive.recordings]
-        require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
+        planning.require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
         diagnosis = estimation.diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
-    checked = check_plan(stored, diagnosis)
+    checked = planning.check_plan(stored, diagnosis)
     following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
     if json:
         following_up = following if diagnosis.undecided else None
@@ -212,7 +202,7 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     return LOSSY if lossy else CLEAN
 
 
-def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = "") -> list[str]:
+def format_plan(made: planning.Plan, driven_s: float, files: Sequence[Path], said: str = "") -> list[str]:
     """The plan on one screen, what it will decide first.
 
     Args:
@@ -221,8 +211,6 @@ def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = 
         files: the files that were written.
         said: flags that the next command needs again.
     """
-    from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
-
     runs = f"after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
     if not made.questions:
         return [f"no open question {runs}: no cause is undecided, and each number is known well enough"]
@@ -241,7 +229,7 @@ def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = 
         most,
         f"play         ros2 bag play {files[2]}    # {made.type_name} on {made.topic}",
         f"page         {files[-1]}",
-        *(f"safety       {text}" for text in SAFETY),
+        *(f"safety       {text}" for text in planning.SAFETY),
         f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",
     ]
 
@@ -291,7 +279,12 @@ def simulate(  # noqa: D417 - arguments document themselves
             "cases": {one.name: one.shows for one in list_cases()},
             "effects": {one.id: one.formula for one in (*list_effects(), *list_written_effects())},
         }
-        return print_result(lists, lambda: _format_case(lists), json=json)
+        lines = [
+            line
+            for title, rows in lists.items()
+            for line in (title, *(f"  {row}" for row in align_rows(list(rows.items()))))
+        ]
+        return print_result(lists, lambda: lines, json=json)
     effects = dict(_parse_effect(text) for text in effect or [])
     if len(effects) < len(effect or []):
         hint = "Give all its numbers at once: --effect ID=NAME:VALUE,NAME:VALUE."
@@ -314,7 +307,7 @@ def simulate(  # noqa: D417 - arguments document themselves
 
 def list_written_effects() -> tuple[EffectSpec, ...]:
     """Effects of the catalogue that the simulator does not have, by the formulas of their files."""
-    from pipeline import models, simulate  # noqa: PLC0415 - heavy
+    from pipeline import simulate  # noqa: PLC0415 - heavy
 
     known = {effect.id for effect in simulate.list_effects()}
     return tuple(
@@ -350,11 +343,3 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
         hint = "Give each number of an effect once."
         raise SlipError("number_twice", "a number is given twice", where=text, hint=hint)
     return name, numbers
-
-
-def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:
-    return [
-        line
-        for title, rows in lists.items()
-        for line in (title, *(f"  {row}" for row in align_rows(list(rows.items()))))
-    ]

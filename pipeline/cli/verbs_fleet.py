@@ -6,11 +6,11 @@ import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline import datasets, models, words
+from pipeline import datasets, models, store, words
 from pipeline.cli.conventions import (
     All,
     Choices,
@@ -24,11 +24,6 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import open_model
 from pipeline.core import SlipError, align_rows, format_count, suffix_unit
-
-if TYPE_CHECKING:
-    from pipeline.analysis import Options
-    from pipeline.sources import Owner
-    from pipeline.store import Manifest
 
 
 def check(  # noqa: D417 - the arguments document themselves
@@ -61,24 +56,35 @@ def check(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    _require_target(to, file, json=json)
-    _require_runs(after)
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-
+    if to is None and file is not None:
+        what, hint = "--file says where, and not in which format", "Add --to markdown or --to junit."
+        raise SlipError("wrong_options", what, hint=hint)
+    if to is not None and file is None and json:
+        what, hint = f"--json and --to {to} would both be printed", "Add --file FILE, or leave one out."
+        raise SlipError("wrong_options", what, hint=hint)
+    if Path(after).suffix == ".toml":
+        what = "AFTER is a model file, and not what was driven"
+        hint = f"Give it first and the log, folder or run second: slip check {after} LOG."
+        raise SlipError("after_not_driven", what, where=after, hint=hint)
     bounds = None if limits is None else datasets.read_limits(limits)
-    options = build_options(Choices(results=results))
     known = open_model(Path(before), effects) if Path(before).suffix == ".toml" else None
     silent = quiet or json or (to is not None and file is None)
+    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
+
     with ExitStack() as stack:
-        first = _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
-        second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
-        owner: Owner | None = vehicle_of
+
+        def open_runs(names: str) -> list[store.Manifest]:
+            asked = replace(build_options(Choices(results=results)), diagnosis=known is None)
+            shown = (open_shown(name, asked, quiet=silent) for name in list_named(names))
+            manifests = [stack.enter_context(one).manifest for one in shown]
+            return list({one.run: one for one in manifests}.values())
+
         checked = datasets.check_runs(
-            first,
-            second,
-            Store(results),
+            open_runs(before) if known is None else known,
+            open_runs(after),
+            store.Store(results),
             source=input,
-            owner=owner,
+            owner=vehicle_of,
             limits=bounds,
             simulated=simulated,
         )
@@ -93,42 +99,6 @@ def check(  # noqa: D417 - the arguments document themselves
     elif not quiet and (to is None or file is not None):
         print_lines(words.format_lines(words.list_lines(checked)))
     return checked.code
-
-
-def _require_target(to: str | None, file: Path | None, *, json: bool) -> None:
-    """Refuse a file without a format, and two formats on standard output."""
-    if to is None and file is not None:
-        what, hint = "--file says where, and not in which format", "Add --to markdown or --to junit."
-    elif to is not None and file is None and json:
-        what, hint = (
-            f"--json and --to {to} would both be printed",
-            "Add --file FILE, or leave one out.",
-        )
-    else:
-        return
-    raise SlipError("wrong_options", what, hint=hint)
-
-
-def _require_runs(after: str) -> None:
-    """Refuse a model as AFTER."""
-    if Path(after).suffix == ".toml":
-        what = "AFTER is a model file, and not what was driven"
-        hint = f"Give it first and the log, folder or run second: slip check {after} LOG."
-        raise SlipError("after_not_driven", what, where=after, hint=hint)
-
-
-def _open_runs(
-    names: str, options: Options, stack: ExitStack, *, diagnosed: bool, quiet: bool
-) -> list[Manifest]:
-    """Runs of a comma-separated list of names, each once; a folder means all logs in it."""
-    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
-
-    manifests: dict[str, Manifest] = {}
-    for name in list_named(names):
-        asked = replace(options, diagnosis=diagnosed)
-        manifest = stack.enter_context(open_shown(name, asked, quiet=quiet)).manifest
-        manifests.setdefault(manifest.run, manifest)
-    return list(manifests.values())
 
 
 _MOST = 8
@@ -165,11 +135,10 @@ def fit(  # noqa: D417 - the results folder documents itself
         quiet: print nothing.
     """
     from pipeline.report.datasets_page import write_fleet  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    store = Store(results)
-    fleet = datasets.fit_results(store)
-    file = str(write_fleet(store, fleet)["fleet.parquet"])
+    folder = store.Store(results)
+    fleet = datasets.fit_results(folder)
+    file = str(write_fleet(folder, fleet)["fleet.parquet"])
     lines = _format_fleet(fleet, everything=everything)
     return print_result({**fleet.to_json(), "file": file}, lambda: lines, json=json, quiet=quiet)
 
@@ -186,9 +155,7 @@ def show(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-
-    fleet = datasets.fit_results(Store(results))
+    fleet = datasets.fit_results(store.Store(results))
     return print_result(
         fleet.to_json(), lambda: _format_fleet(fleet, everything=everything), json=json, quiet=quiet
     )
@@ -241,12 +208,11 @@ def trend(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     from pipeline.report.datasets_page import write_trend  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    store = Store(results)
+    folder = store.Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
-    followed = datasets.follow_trend(store, names)
-    page = write_trend(store, followed).get("trend.html")
+    followed = datasets.follow_trend(folder, names)
+    page = write_trend(folder, followed).get("trend.html")
     content = {**followed.to_json(), "page": None if page is None else str(page)}
     lines = align_rows([(one.group, one.quantity, one.describe()) for one in followed.series])
     lines += [f"! {note}" for note in followed.notes] + ([f"page    {page}"] if page else [])

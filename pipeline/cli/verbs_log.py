@@ -13,27 +13,23 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline import models
-from pipeline.analysis import Options
+from pipeline import models, store
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
     All,
+    Asked,
     Choices,
-    Limit,
-    MemoryLimit,
     OwnEffects,
     build_options,
     exit_code,
     format_vehicle_source,
-    print_error,
     print_json,
     print_lines,
     print_note,
     print_result,
     show_progress,
     spell_choices,
-    summarize_error,
 )
 from pipeline.core import (
     LONGEST_NAME,
@@ -73,7 +69,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     model: Path | None = None,
     effects: OwnEffects = None,
     force: bool = False,
-    limit: Limit,
+    asked: Asked,
     everything: All = False,
     json: bool = False,
     quiet: bool = False,
@@ -92,76 +88,33 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     """
     if effects:
         models.load_effects(effects)
-    options = build_options(choices)
-    options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
+    options = replace(build_options(choices), report=report, diagnosis=diagnosis, figures=figures)
+    options = replace(options, force=force, model=model)
     outcomes: list[Outcome] = []
-    errors: list[dict[str, str]] = []
+    asked.list_runs = lambda: [{**one.summary, "same_content_as": one.twin or None} for one in outcomes]
+    if report:
+        from pipeline.report.theme import warm_bundle  # noqa: PLC0415 - only for reports
 
-    def conclude(error: SlipError) -> None:
-        if json:
-            _print_json(outcomes, [*errors, summarize_error(error.where, error)])
-
-    limit.conclude = conclude
-    _analyze_all(logs, options, outcomes, errors, limit, quiet=quiet or json)
-    if json:
-        _print_json(outcomes, errors)
-    elif not quiet:
-        _print_outcomes(outcomes, spell_choices(choices), everything=everything)
-    return exit_code(errors, lossy=any(outcome.lossy or outcome.refusal for outcome in outcomes))
-
-
-def _print_json(outcomes: list[Outcome], errors: list[dict[str, str]]) -> None:
-    print_json(
-        {
-            "runs": [{**outcome.summary, "same_content_as": outcome.twin or None} for outcome in outcomes],
-            "errors": errors,
-        }
-    )
-
-
-def _analyze_all(
-    logs: list[Path],
-    options: Options,
-    outcomes: list[Outcome],
-    errors: list[dict[str, str]],
-    limit: MemoryLimit,
-    *,
-    quiet: bool,
-) -> None:
-    """Analyze the logs in turn, appending to outcomes and errors; an error affects only one log."""
-    if options.report:
-        _warm_report()
+        # In the background, while the log is read.
+        warm_bundle()
     from pipeline.analysis.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     for log in logs:
-        limit.at_work = str(log)
-        try:
-            with show_progress(log.name, quiet=quiet) as progress:
-                outcomes.append(analyze_log(log, options, progress))
-        except SlipError as error:
-            print_error(error)
-            errors.append(summarize_error(str(log), error))
+        with asked.attempt(str(log)), show_progress(log.name, quiet=quiet or json) as progress:
+            outcomes.append(analyze_log(log, options, progress))
     if any(outcome.computed for outcome in outcomes):
-        update_datasets(Store(options.out))
+        update_datasets(store.Store(options.out))
+    if json:
+        print_json(asked.to_json())
+    elif not quiet:
+        from pipeline.cli.screen import format_run  # noqa: PLC0415 - only for people
 
-
-def _warm_report() -> None:
-    """Load the report's plotting code in the background while the log is read."""
-    from pipeline.report.theme import warm_bundle  # noqa: PLC0415 - only for reports
-
-    warm_bundle()
-
-
-def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> None:
-    from pipeline.cli.screen import format_run  # noqa: PLC0415 - only for people
-
-    for outcome in outcomes:
-        text = format_run(
-            outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said,
-            everything=everything,
-        )  # fmt: skip
-        print_lines(text.splitlines())
+        said = spell_choices(choices)
+        for one in outcomes:
+            is_same = not one.computed
+            text = format_run(one.summary, unchanged=is_same, twin=one.twin, said=said, everything=everything)
+            print_lines(text.splitlines())
+    return exit_code(asked.errors, lossy=any(outcome.lossy or outcome.refusal for outcome in outcomes))
 
 
 _OTHER_CLOCK_S = 3600.0
@@ -251,7 +204,10 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     lines.append(f"health    {'complete' if not seen.losses else 'with losses'}{unchecked}")
     lines += _cut([f"  lost    {loss.text}" for loss in seen.losses], everything=everything)
     lines += _cut([f"  note    {note}" for note in seen.notes], everything=everything)
-    lines += _format_metadata(seen) if everything else []
+    if everything:
+        for name, record in index.metadata.items():
+            texts = [f"{key} = {' '.join(value.split())}" for key, value in record.items()]
+            lines.append(f"metadata  {shorten(name, LONGEST_NAME)}: {name_first(texts, _MOST_ENTRIES)}")
     # Of a log that cannot be analyzed any topic may tell why.
     lines += ["", *_format_topics(seen, everything=everything or seen.problem is not None), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
@@ -282,14 +238,6 @@ def _cut(lines: Sequence[str], *, everything: bool) -> list[str]:
     if everything or len(lines) <= _MOST_NOTES:
         return list(lines)
     return [*lines[:_MOST_NOTES], f"          {len(lines) - _MOST_NOTES} more (--all)"]
-
-
-def _format_metadata(seen: Inspection) -> list[str]:
-    return [
-        f"metadata  {shorten(name, LONGEST_NAME)}: "
-        + name_first([f"{key} = {' '.join(value.split())}" for key, value in record.items()], _MOST_ENTRIES)
-        for name, record in seen.index.metadata.items()
-    ]
 
 
 def _format_roles(seen: Inspection, *, everything: bool) -> list[str]:
@@ -392,10 +340,9 @@ def stage(  # noqa: D417 - the shared choices document themselves
         quiet: print nothing.
     """
     from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - heavy
-    from pipeline.store import find_log  # noqa: PLC0415 - heavy
 
     options = replace(build_options(choices), force=force, through=name)
-    path = find_log(log, options.out)
+    path = store.find_log(log, options.out)
     with show_progress(path.name, quiet=quiet or json) as progress:
         outcome = analyze_log(path, options, progress)
     tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}

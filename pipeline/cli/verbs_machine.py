@@ -19,10 +19,11 @@ from urllib.parse import urlencode
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline import core, models, store
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
-    Limit,
+    Asked,
     OwnEffects,
     Results,
     print_json,
@@ -41,7 +42,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     effects: OwnEffects = None,
     timeout: PositiveFloat = 1800.0,
-    limit: Limit,
+    asked: Asked,
     open_browser: Annotated[bool, Parameter(name="--open")] = False,
     json: bool = False,
     quiet: bool = False,
@@ -64,12 +65,10 @@ def serve(  # noqa: D417 - the results folder documents itself
     """
     for package in ("uvicorn", "starlette", "numba", "vl_convert"):
         require_package(package, "serve", "the workbench")
-    from pipeline.models import load_effects  # noqa: PLC0415 - heavy
-    from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
     from pipeline.web import LOOPBACK, Limits  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 
-    load_effects(effects or ())
+    models.load_effects(effects or ())
 
     def notify(address: str, token: str) -> None:
         whole = f"{address}?token={token}{opened}"
@@ -88,15 +87,15 @@ def serve(  # noqa: D417 - the results folder documents itself
         )
     limits = Limits(
         timeout_s=timeout,
-        memory_bytes=measure_memory() // 2 if limit.given is None else limit.limit_bytes,
+        memory_bytes=measure_memory() // 2 if asked.memory is None else asked.limit_bytes,
     )
     opened = ""
     # A folder that is not there yet is filled by dropped logs.
     named = None if run is None else Path(run)
-    if named is not None and (named.is_dir() or not (named.exists() or Store(results).runs())):
+    if named is not None and (named.is_dir() or not (named.exists() or store.Store(results).runs())):
         results = named
     elif run is not None:
-        opened = f"#{urlencode({'a': find_run(run, Store(results)).run})}"
+        opened = f"#{urlencode({'a': store.find_run(run, store.Store(results)).run})}"
     serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)
     return CLEAN
 
@@ -169,12 +168,19 @@ def _look(results: Path) -> Iterator[Check]:
     yield _look_at_packages()
     yield _look_at_extras()
     yield _look_at_loops()
-    yield _look_for_browser()
+    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    lacking = "not found; reports and figures do without it"
+    hint = "" if path else "For pictures of pages and their tests: make browser"
+    yield Check("Chromium", "ok" if path else "optional", path or lacking, hint)
     # A missing folder is created in its nearest existing parent.
     parent = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
-    yield _look_at_disk(parent)
+    free = shutil.disk_usage(parent).free
+    hint = "" if free >= _LEAST_FREE_BYTES else "Free some, or name another disk with --results"
+    yield _judge("disk", f"{free / 1e9:.1f} GB free at {parent}", hint)
     yield _look_at_permission(parent)
-    yield _look_at_locale()
+    names, screen = sys.getfilesystemencoding(), sys.stdout.encoding
+    hint = "" if {names.lower(), screen.lower()} == {"utf-8"} else "Set LC_ALL=C.UTF-8, or PYTHONUTF8=1"
+    yield _judge("locale", f"file names in {names}, screen in {screen}", hint)
     yield _look_at_clock()
 
 
@@ -223,21 +229,17 @@ def _read_numbers(version: str) -> list[int]:
 
 def compile_every_loop() -> int:
     """Compile the loops of all files; the number of loops compiled."""
-    from pipeline.core import compile_loops  # noqa: PLC0415 - heavy
-
     root = Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
         if "\n@compiled" in path.read_text(encoding="utf-8"):
             importlib.import_module(".".join(("pipeline", *path.relative_to(root).with_suffix("").parts)))
-    return compile_loops()
+    return core.compile_loops()
 
 
 def _look_at_loops() -> Check:
-    from pipeline.core import list_caches  # noqa: PLC0415 - heavy
-
     name = "compiled loops"
     count = compile_every_loop()
-    caches = list_caches()
+    caches = core.list_caches()
     if find_spec("numba") is None:
         hint = f"For diagnoses: pip install '{PACKAGE}[diagnose]'"
         return Check(name, "optional", "Numba is not installed; slip tables do without it", hint)
@@ -251,20 +253,6 @@ def _look_at_loops() -> Check:
     return Check(name, "ok", f"{count} kept in {os.path.commonpath([str(folder) for folder in caches])}")
 
 
-def _look_for_browser() -> Check:
-    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if path:
-        return Check("Chromium", "ok", path)
-    what = "not found; reports and figures do without it"
-    return Check("Chromium", "optional", what, "For pictures of pages and their tests: make browser")
-
-
-def _look_at_disk(folder: Path) -> Check:
-    free = shutil.disk_usage(folder).free
-    hint = "" if free >= _LEAST_FREE_BYTES else "Free some, or name another disk with --results"
-    return _judge("disk", f"{free / 1e9:.1f} GB free at {folder}", hint)
-
-
 def _look_at_permission(folder: Path) -> Check:
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -273,12 +261,6 @@ def _look_at_permission(folder: Path) -> Check:
         hint = "Give your user the right to write there, or name another folder with --results"
         return Check("permission", "problem", f"{folder} cannot be written to: {error.strerror}", hint)
     return Check("permission", "ok", f"{folder} can be written to")
-
-
-def _look_at_locale() -> Check:
-    names, screen = sys.getfilesystemencoding(), sys.stdout.encoding
-    hint = "" if {names.lower(), screen.lower()} == {"utf-8"} else "Set LC_ALL=C.UTF-8, or PYTHONUTF8=1"
-    return _judge("locale", f"file names in {names}, screen in {screen}", hint)
 
 
 def _look_at_clock() -> Check:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from pipeline import core, store
 from pipeline.cli.conventions import (
     CLEAN,
     EXPLAINED,
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.batch.batch_check import Status, Verification
-    from pipeline.store import Manifest, Sample
 
 _WIDE = 200
 _ROWS_AT_ONCE = 1 << 16
@@ -97,12 +97,10 @@ def _print_table(answer: pl.DataFrame) -> None:
 def _print_csv(answer: pl.DataFrame) -> None:
     import polars as pl  # noqa: PLC0415 - heavy
 
-    from pipeline.core import format_csv  # noqa: PLC0415 - heavy
-
     try:
-        _write(format_csv(answer.clear()))
+        _write(core.format_csv(answer.clear()))
         for part in answer.iter_slices(_ROWS_AT_ONCE):
-            _write(format_csv(part, header=False))
+            _write(core.format_csv(part, header=False))
     except pl.exceptions.PolarsError as error:
         said = str(error).splitlines()[0]
         raise SlipError(
@@ -157,21 +155,18 @@ def status(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
     """
     from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
-    from pipeline.store import find_run  # noqa: PLC0415 - heavy
 
-    store = open_results(results)
+    folder = open_results(results)
     if run is not None:
-        manifest = find_run(run, store)
+        manifest = store.find_run(run, folder)
         content = {"run": manifest.run, "key": manifest.key, **manifest.details}
         return print_result(content, lambda: _format_origin(manifest), json=json)
-    status_now = read_status(store)
+    status_now = read_status(folder)
     print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
     return FAILED if status_now.errors else CLEAN
 
 
 def _as_json(status_now: Status) -> dict[str, object]:
-    import msgspec  # noqa: PLC0415 - help does without
-
     return {
         **status_now.counts,
         "runs": status_now.runs,
@@ -179,7 +174,7 @@ def _as_json(status_now: Status) -> dict[str, object]:
         "old_generations": status_now.old_generations,
         "last": status_now.last,
         "logs": [
-            {"path": entry.log.path, **{k: v for k, v in msgspec.to_builtins(entry).items() if k != "log"}}
+            {"path": entry.log.path, **{k: v for k, v in asdict(entry).items() if k != "log"}}
             for entry in status_now.entries
         ],
         "errors": [summarize_error(error.where, error) for error in status_now.errors],
@@ -230,10 +225,10 @@ def verify(  # noqa: D417 - arguments document themselves
     from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
 
     drawn = parse_sample(sample, seed)
-    store = open_results(results)
+    folder = open_results(results)
     with show_progress("verify", quiet=quiet or json) as notify:
         verification = verify_results(
-            store,
+            folder,
             logs=logs,
             notify=notify,
             repair=repair,
@@ -249,14 +244,12 @@ def verify(  # noqa: D417 - arguments document themselves
     return CLEAN if verification.is_clean else FAILED
 
 
-def parse_sample(text: str | None, seed: str | None) -> Sample | None:
+def parse_sample(text: str | None, seed: str | None) -> store.Sample | None:
     """The sample of ``5%``, its seed by default that of the UTC day; None where none is asked for.
 
     Raises:
         SlipError: ``bad_sample``.
     """
-    from pipeline.store import Sample  # noqa: PLC0415 - only where it is asked for
-
     if text is None:
         if seed is not None:
             raise SlipError("bad_sample", "--seed does nothing by itself", hint="Add --sample, as 5%")
@@ -266,7 +259,7 @@ def parse_sample(text: str | None, seed: str | None) -> Sample | None:
     if not 0.0 < percent <= 100.0:  # noqa: PLR2004 - all of it
         hint = "Write for example 5%"
         raise SlipError("bad_sample", f"{text!r} is not a share of the files", hint=hint)
-    return Sample(percent / 100.0, seed or f"{datetime.now(UTC):%Y-%m-%d}")
+    return store.Sample(percent / 100.0, seed or f"{datetime.now(UTC):%Y-%m-%d}")
 
 
 def _check_as_json(verification: Verification, *, repair: bool) -> dict[str, object]:
@@ -325,7 +318,7 @@ def _format_check(verification: Verification) -> list[str]:
     return lines
 
 
-def _format_origin(manifest: Manifest) -> list[str]:
+def _format_origin(manifest: store.Manifest) -> list[str]:
     details = manifest.details
     log = manifest.part("log")
     lines = [
@@ -352,7 +345,7 @@ def _format_origin(manifest: Manifest) -> list[str]:
     return lines
 
 
-def _format_alignment(manifest: Manifest) -> list[str]:
+def _format_alignment(manifest: store.Manifest) -> list[str]:
     """Lines of the alignment values, and the slip before and after alignment."""
     if not {"alignments", "aggregates"} <= set(manifest.tables):
         return []

@@ -21,10 +21,18 @@ if TYPE_CHECKING:
     )
     from pipeline.datasets.compared_runs import NOT_VALID, Question, find_material
     from pipeline.datasets.deployments import DeploymentMap, draw_up_map
-    from pipeline.datasets.fleet import Band, Expected, Fleet, expect_run, fit_results
+    from pipeline.datasets.fleet import Band, Fleet, fit_results
     from pipeline.datasets.pairs import ALIKE, DIFFERENT, OF_TWO_RUNS, THIS_RUN, UNTESTED, judge_pair
     from pipeline.datasets.pooling import MEASURES, ComparisonError, gather_runs, pool_runs
-    from pipeline.datasets.stored_fits import ModelFit, contest_models, fit_to_runs, read_runs
+    from pipeline.datasets.stored_fits import (
+        ModelFit,
+        contest_models,
+        expect_model,
+        fit_to_runs,
+        judge_measured,
+        put_on_runs,
+        read_runs,
+    )
     from pipeline.datasets.trend import Series, Trend, follow_trend
 else:
     __getattr__ = open_door(__name__, __file__)

@@ -24,7 +24,7 @@ from pipeline.datasets.compared_runs import (
     note_untested,
 )
 from pipeline.datasets.fleet import fit_results, name_levels
-from pipeline.datasets.levels import LEVEL, fit_levels
+from pipeline.datasets.levels import LEVEL, adjust, fit_levels
 from pipeline.datasets.pairs import BLOCKS, RUNS
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.models import list_effects, name_effect
@@ -236,13 +236,9 @@ def _describe(group: _Group, causes: Sequence[tuple[str, str]]) -> Budget:
 
 
 def _compare(a: _Group, b: _Group, causes: Sequence[tuple[str, str]]) -> Difference:
-    from scipy.stats import false_discovery_control  # noqa: PLC0415 - heavy
-
     scale = 1.0 / max(math.sqrt(a.mean_square) + math.sqrt(b.mean_square), 1e-300)
     tests = [_test(a, b, index) for index in range(len(causes))]
-    known = [index for index, (*_, p) in enumerate(tests) if p is not None]
-    ps = [p for *_, p in tests if p is not None]
-    adjusted = dict(zip(known, false_discovery_control(ps).tolist(), strict=True)) if known else {}
+    adjusted = adjust([p for *_, p in tests])
     parts = [
         CausePart(
             name,
@@ -250,7 +246,7 @@ def _compare(a: _Group, b: _Group, causes: Sequence[tuple[str, str]]) -> Differe
             scale * value,
             None if low is None else scale * low,
             None if high is None else scale * high,
-            adjusted.get(index),
+            adjusted[index],
         )
         for index, ((name, kind), (value, low, high, _)) in enumerate(zip(causes, tests, strict=True))
         if a.table[:, index].any() or b.table[:, index].any()

@@ -30,7 +30,7 @@ from pipeline.datasets.check_readings import (
     RunReading,
 )
 from pipeline.datasets.check_sides import AFTER, BEFORE, Sides, read_sides
-from pipeline.datasets.levels import Levels, fit_levels
+from pipeline.datasets.levels import Levels, adjust, fit_levels
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.models import ModelFile, name_number
 from pipeline.sources import Fault, Owner, convert_to
@@ -314,8 +314,6 @@ def check_runs(
 
 def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> Check:
     """Compare two sides that were fitted with one model."""
-    from scipy.stats import false_discovery_control  # noqa: PLC0415 - heavy
-
     pace = math.exp(float(np.mean(np.log([one.pace for one in sides.after]))))
     blank = [
         Number(
@@ -337,10 +335,11 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
             size = max(abs(before - neutral), abs(after - neutral), kind.usual_size)
             number = replace(number, before=before, after=after, size=size)
         numbers.append(number)
-    known_numbers = [one for one in numbers if one.is_known]
-    adjusted = false_discovery_control([one.p for one in known_numbers]) if known_numbers else []
-    known = {one.name: float(p) for one, p in zip(known_numbers, adjusted, strict=True)}
-    judged = [replace(one, p_adjusted=known.get(one.name, math.nan)) for one in numbers]
+    adjusted = adjust([finite_or_none(one.p) for one in numbers])
+    judged = [
+        replace(one, p_adjusted=math.nan if p is None else p)
+        for one, p in zip(numbers, adjusted, strict=True)
+    ]
     judged.sort(key=lambda one: (not one.is_known, one.p_adjusted, one.p if one.is_known else 0.0))
     check = Check(sides, tuple(judged))
     return (

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core import INPUTS, NORMAL_95, SlipError
 from pipeline.datasets.check_readings import Label, RunReading, list_labels, measure_slip, read_run
-from pipeline.datasets.compared_runs import find_run_refusal
+from pipeline.datasets.compared_runs import find_run_refusal, read_digest
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.run_residuals import Input, choose_input
@@ -98,8 +98,8 @@ def read_sides(
     manifests, notes_before = _leave_out_refused(() if isinstance(before, ModelFile) else before, BEFORE)
     after, notes_after = _leave_out_refused(after, AFTER)
     everything = [*manifests, *after]
-    held = {_digest(one) for one in manifests} - {""}
-    if shared := sorted({one.run for one in after if _digest(one) in held}):
+    held = {read_digest(one) for one in manifests}
+    if shared := sorted({one.run for one in after if read_digest(one) in held}):
         what = f"a run is on both sides: {', '.join(shared)}"
         raise ComparisonError("same_run", what, hint="Give runs before the change, and others after it.")
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
@@ -116,7 +116,7 @@ def read_sides(
         tuple(replace(one, slip=slips.get(one.run, one.slip)) for one in side)
         for side in (both.before, both.after)
     ]
-    others = _list_others(store, both, {_digest(one) for one in everything})
+    others = _list_others(store, both, {read_digest(one) for one in everything})
     return replace(
         both,
         before=known[0],
@@ -134,8 +134,8 @@ def _list_others(store: Store, sides: Sides, held: Collection[str]) -> list[Mani
     for manifest in store.survey().manifests if room > 0 else ():
         is_here = manifest.details.get("terrain") in terrains
         if is_here and manifest.part("vehicle").get("id") == sides.model.model.vehicle.id:
-            digest = _digest(manifest)
-            if digest and digest not in held and not find_run_refusal(manifest):
+            digest = read_digest(manifest)
+            if digest not in held and not find_run_refusal(manifest):
                 others.setdefault(digest, manifest)
     return [*others.values()][-max(room, 1) :]
 
@@ -208,10 +208,6 @@ def read_under(
             raise ComparisonError("nothing_to_compare", what, hint="Give other runs, or drive longer.")
     before, after = map(tuple, sides)
     return Sides(file, chosen.source, labels, before, after, tuple(notes), is_model=is_model)
-
-
-def _digest(manifest: Manifest) -> str:
-    return str(manifest.part("log").get("sha256", ""))
 
 
 def _find_model(manifest: Manifest, store: Store, *, is_needed: bool) -> Model | None:

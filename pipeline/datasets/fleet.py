@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +22,7 @@ from pipeline.datasets.compared_runs import find_material, read_digest
 from pipeline.datasets.levels import Levels, Pooled, fit_levels
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError
 from pipeline.models import Effect, Late, Level, Parameter, Place, cut_interval, find_effect, is_of_one_run
+from pipeline.run import MotionRun
 from pipeline.store import Store, lack_runs
 from schemas import tabulate
 
@@ -349,56 +350,53 @@ class Expected:
     """What to expect of a vehicle on a terrain, by the table of its numbers.
 
     Attributes:
-        vehicle, terrain: names.
         effects: at their expected values, in the order of the signal path from the command.
         prior: mean and standard deviation of another run, of every parameter by label.
-        here: runs of the vehicle on this terrain.
-        elsewhere: its runs on other terrains.
     """
 
-    vehicle: str
-    terrain: str
     effects: tuple[Effect, ...]
     prior: dict[str, tuple[float, float]]
-    here: tuple[str, ...]
-    elsewhere: tuple[str, ...]
 
 
-def expect_run(
-    store: Store,
-    vehicle: str,
-    terrain: str,
-    source: Literal["command", "measured"] = "command",
-    *,
-    without: Collection[str] = (),
+def expect_here(
+    runs: Sequence[MotionRun], vehicle: str, source: Literal["command", "measured"], store: Store
 ) -> Expected:
-    """Expect the parameters of a vehicle in another run on a terrain.
+    """Expect the parameters of a vehicle on the ground of runs, which themselves do not count.
 
     Effects are those in the models of half of its runs on this terrain, or of all where it has none there. A
     value is the level of the terrain, else that of the vehicle. Spreads that the runs do not tell are the
     usual ones.
 
     Args:
-        store: the results.
+        runs: runs of the vehicle on one terrain, which need not have others.
         vehicle: id of the vehicle.
-        terrain: name of the terrain; it need not have runs.
         source: input of the model.
-        without: SHA-256 of recordings to leave out, such as those to be predicted.
+        store: the results.
 
     Raises:
-        ComparisonError: ``no_such_vehicle``: no other run of the vehicle on a known terrain has estimates.
+        ComparisonError: ``no_such_vehicle``: no other run of the vehicle on a known terrain has estimates;
+            ``several_terrains``.
     """
+    terrains = sorted({run.terrain for run in runs})
+    if len(terrains) > 1:
+        raise ComparisonError(
+            "several_terrains",
+            f"the runs are on {', '.join(terrains)}, and a prior applies to one terrain",
+            where=", ".join(run.name for run in runs),
+            hint="Fit the runs of each terrain separately.",
+        )
+    held = {run.sha256 for run in runs}
     compared = find_material(store, ("vehicle",), trusted_only=True, tables=("estimates",), vehicle=vehicle)
-    runs = [run for run, manifest in compared.manifests.items() if read_digest(manifest) not in without]
-    estimates = compared.read_estimates() if runs else tabulate("estimates", [])
-    known = estimates.filter(pl.col("run").is_in(runs)) if runs else estimates
-    return expect_numbers(known, vehicle, terrain, source)
+    others = [run for run, manifest in compared.manifests.items() if read_digest(manifest) not in held]
+    estimates = compared.read_estimates() if others else tabulate("estimates", [])
+    known = estimates.filter(pl.col("run").is_in(others)) if others else estimates
+    return expect_numbers(known, vehicle, terrains[0], source)
 
 
 def expect_numbers(
     estimates: pl.DataFrame, vehicle: str, terrain: str, source: Literal["command", "measured"] = "command"
 ) -> Expected:
-    """As `expect_run`, from rows of the table `estimates`."""
+    """As `expect_here`, from rows of the table `estimates`."""
     rows = (
         _take_numbers(estimates, source).filter(pl.col("vehicle") == vehicle, pl.col("terrain") != UNKNOWN)
         if estimates.height
@@ -421,9 +419,7 @@ def expect_numbers(
             values[number.name] = float(np.clip(mean, *number.bounds))
             prior[f"{effect.id}.{number.name}"] = (values[number.name], deviation)
         effects.append(effect.change(**values))
-    here = set(there["run"])
-    elsewhere = tuple(sorted(set(rows["run"]) - here))
-    return Expected(vehicle, terrain, tuple(effects), prior, tuple(sorted(here)), elsewhere)
+    return Expected(tuple(effects), prior)
 
 
 def _expect(rows: pl.DataFrame, terrain: str, number: Parameter) -> tuple[float, float]:

@@ -238,6 +238,15 @@ def _climb(y: Floats, members: Floats, known: Floats) -> float:
     return float(minimize_scalar(look, bounds=ends, method="bounded", options={"xatol": 1e-6 * ends[1]}).x)
 
 
+def adjust(ps: Sequence[float | None]) -> list[float | None]:
+    """P of tests, over all of them (Benjamini and Hochberg, J. R. Stat. Soc. B 57, 1995); None stays None."""
+    from scipy.stats import false_discovery_control  # noqa: PLC0415 - heavy
+
+    known = [p for p in ps if p is not None]
+    adjusted = iter(false_discovery_control(known).tolist() if known else [])
+    return [None if p is None else float(next(adjusted)) for p in ps]
+
+
 def find_range_p(score: float, groups: int, freedom: float) -> float:
     """Probability that the largest difference of so many equal groups is larger, in its standard errors."""
     from scipy.stats import studentized_range  # noqa: PLC0415 - heavy

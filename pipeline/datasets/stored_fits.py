@@ -1,9 +1,11 @@
 """Models fitted to stored runs, and contests of models with those of the literature."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from pipeline.core import NORMAL_95
 from pipeline.datasets.compared_runs import find_run_refusal
+from pipeline.datasets.fleet import expect_here
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.errors import Errors, errors_as_json
@@ -11,17 +13,18 @@ from pipeline.estimation.estimates import correlations_as_json, parameters_as_js
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import measure_by_terrain
 from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, note_fit, step_as_json
+from pipeline.estimation.odometry_noise import measure_alphas
 from pipeline.estimation.rivals import (
     Contest,
     contest_as_json,
     hold_contest,
     judge_rival,
 )
-from pipeline.estimation.run_residuals import InputChoice, choose_input
-from pipeline.models import Effect, ModelFile, list_models
-from pipeline.run import MotionError, MotionRun, load_motion_run
+from pipeline.estimation.run_residuals import Input, InputChoice, choose_input
+from pipeline.models import Effect, Model, ModelFile, cut_interval, find_effect, list_models
+from pipeline.run import MotionError, MotionRun, cut_run, find_driven, load_motion_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
-from pipeline.store import Manifest
+from pipeline.store import Manifest, Store
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,17 @@ class ModelFit:
         """Reasons why added effects do not reduce the held-out error, by id; empty if they do."""
         before, after = self.before.whole, self.after.whole
         return explain_refusals(self.after.data, before, after, lambda: self.file.intervals)
+
+    def prior_as_json(self) -> dict[str, dict[str, object]]:
+        """What was known of the numbers before the fit, by label: value, 95 % interval and unit."""
+        values: dict[str, dict[str, object]] = {}
+        for label, (mean, deviation) in self.after.data.paths[0].prior.numbers.items():
+            effect, _, name = label.partition(".")
+            half = NORMAL_95 * deviation
+            parameter = find_effect(effect)().parameter(name)
+            low, high = cut_interval(mean - half, mean + half, parameter.bounds)
+            values[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
+        return values
 
     def to_json(self) -> dict[str, object]:
         """The keys of `slip model fit --json` that the fit provides."""
@@ -114,12 +128,22 @@ def read_runs(
     return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
 
 
+def put_on_runs(
+    file: ModelFile, manifests: Sequence[Manifest], owner: Owner | None
+) -> tuple[ModelFile, list[MotionRun]]:
+    """A model with the vehicle whose geometry is used, and the runs, as `read_runs` loads them."""
+    vehicle, runs = read_runs(manifests, file.model.vehicle, owner)
+    return replace(file, model=replace(file.model, vehicle=vehicle)), runs
+
+
 def fit_to_runs(
     before: ModelFile,
     after: ModelFile,
     runs: Sequence[MotionRun],
     source: str | None,
-    tie: Callable[[EstimationData], EstimationData] | None = None,
+    *,
+    first_s: float | None = None,
+    fleet: Store | None = None,
 ) -> ModelFit:
     """Fit a model, and evaluate it before and after a change.
 
@@ -128,21 +152,60 @@ def fit_to_runs(
         after: the model to fit, with the vehicle whose geometry is used.
         runs: runs to fit it to.
         source: `command` or `measured`; None chooses.
-        tie: function that adds prior knowledge of the parameters to the data.
+        first_s: fit to the first seconds of driving of each run; None for all of them.
+        fleet: results whose other runs of the vehicle are a prior of its numbers; None for none.
 
     Raises:
         MotionError: the runs lack the input, or are too short; ``not_fitted``, an added effect cannot act.
+        SlipError: there is no fleet, or ``several_terrains``.
     """
+    if first_s is not None:
+        runs = [cut_run(run, end_s=find_driven(run, first_s)) for run in runs]
     chosen = choose_input(runs, source, after.model, last=before.last_input)
     _require_fitted([effect for effect in after.model if effect.id not in before.model.ids], runs, chosen)
     data = EstimationData(runs, after.model.vehicle, chosen.source)
-    if tie is not None:
-        data = tie(data)
+    if fleet is not None:
+        data = data.with_prior(expect_here(runs, after.model.vehicle.id, chosen.source.value, fleet).prior)
     known = replace(before.model, vehicle=after.model.vehicle)
     old = new = assess_model(data, known, per_run=before.per_run)
     if after.model.effects != known.effects:
         new = assess_model(data, after.model, per_run=after.per_run)
-    return ModelFit(note_fit(after, new), old, new, chosen)
+    noted = note_fit(after, new)
+    said = {"first_s": first_s, "prior": None if fleet is None else "fleet"}
+    fit = {**noted.fit, **{key: value for key, value in said.items() if value is not None}}
+    return ModelFit(replace(noted, fit=fit), old, new, chosen)
+
+
+def expect_model(
+    manifests: Sequence[Manifest], source: str | None, fleet: Store, owner: Owner | None = None
+) -> ModelFile:
+    """The model that the other runs of a fleet expect for the vehicle and the ground of runs.
+
+    Raises:
+        SlipError: runs are of several vehicles or terrains, or there is no fleet.
+    """
+    vehicle, runs = read_runs(manifests, None, owner)
+    chosen = choose_input(runs, source)
+    return ModelFile(Model(vehicle, expect_here(runs, vehicle.id, chosen.source.value, fleet).effects))
+
+
+def judge_measured(file: ModelFile, manifests: Sequence[Manifest]) -> ModelFile:
+    """A model fitted to runs with their measured wheels as input, and AMCL's alphas of each step.
+
+    Args:
+        file: the model, as `slip model fit --input measured` would write it.
+        manifests: the runs.
+
+    Raises:
+        SlipError: a run has no measured wheels, or its vehicle contradicts the model's.
+    """
+    file, runs = put_on_runs(file, manifests, None)
+    data = EstimationData(runs, file.model.vehicle, Input.MEASURED)
+    assessment = assess_model(data, file.model, per_run=file.per_run)
+    noted = note_fit(file, assessment)
+    steps = zip(noted.list_fitted("ladder"), assessment.ladder.steps, strict=True)
+    ladder = [{**row, "odometry_alphas": measure_alphas(data, step.fitted)} for row, step in steps]
+    return replace(noted, fit={**noted.fit, "ladder": ladder})
 
 
 def _require_fitted(added: Sequence[Effect], runs: Sequence[MotionRun], chosen: InputChoice) -> None:

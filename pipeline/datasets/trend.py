@@ -9,7 +9,7 @@ import polars as pl
 from pipeline.core import FEWEST_OF_SPREAD, Floats, suffix_unit
 from pipeline.datasets.compared_runs import find_material
 from pipeline.datasets.fleet import list_numbers
-from pipeline.datasets.levels import LEVEL
+from pipeline.datasets.levels import LEVEL, adjust
 from pipeline.datasets.pooling import gather_runs
 from pipeline.store import Store, lack_runs
 
@@ -132,17 +132,11 @@ def follow_trend(store: Store, by: Sequence[str]) -> Trend:
 
 def find_steps(series: Sequence[Series]) -> list[Series]:
     """The series with their largest steps, and p over all of them; those with a significant step first."""
-    from scipy.stats import false_discovery_control  # noqa: PLC0415 - heavy
-
-    stepped = [replace(one, step=_find_step(one.points)) for one in series]
-    judged_series = [one for one in stepped if one.step is not None]
-    adjusted = (
-        false_discovery_control([one.step.p for one in judged_series if one.step]) if judged_series else []
-    )
-    by_series = {id(one): float(p) for one, p in zip(judged_series, adjusted, strict=True)}
+    steps = [_find_step(one.points) for one in series]
+    adjusted = adjust([None if step is None else step.p for step in steps])
     judged = [
-        replace(one, step=replace(one.step, p_adjusted=by_series[id(one)])) if one.step else one
-        for one in stepped
+        replace(one, step=None if step is None or p is None else replace(step, p_adjusted=p))
+        for one, step, p in zip(series, steps, adjusted, strict=True)
     ]
     return sorted(judged, key=lambda one: (not one.is_changed, one.group, one.quantity))
 

@@ -83,7 +83,7 @@ class Question:
         unit, value: of the number of an interval.
         rows: for each thing that is to be known, its row in the information, last, and of what is not known.
         expected: t of the drive, or half-width of the runs and the drive together.
-        at_most: half-width that 19 of 20 drives reach: the spread of few blocks scatters.
+        at_most: half-width that 19 of 20 drives reach, as the spread of few blocks scatters; 0 for a t.
         decided_after_s: time in the drive from which it is decided; infinite if it is not.
         needs: what would decide it where this drive adds nothing.
     """
@@ -97,7 +97,7 @@ class Question:
     value: float = math.nan
     rows: tuple[tuple[int, ...], ...] = field(default=(), repr=False)
     expected: float = math.nan
-    at_most: float = math.nan
+    at_most: float = 0.0
     decided_after_s: float = math.inf
     needs: str = ""
 

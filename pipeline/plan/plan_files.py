@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -18,21 +18,20 @@ from pipeline.core import (
     format_share,
     group_by,
     parse_toml,
+    pick,
     read_bounded_text,
     suffix_unit,
 )
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
 from pipeline.plan.manoeuvres import LONGEST_S, RATE_HZ, PlanError, is_steered
-from pipeline.plan.plan import SAFETY, Plan, Question
+from pipeline.plan.plan import SAFETY, Plan
 from pipeline.results import RunDiagnosis
 from pipeline.run import MotionRun, name_inputs
-from pipeline.sources import Vehicle
+from pipeline.sources import Fault, Vehicle, convert_to
 from pipeline.store import Manifest, read_choices, replace_file
 from pipeline.words import describe_separation, suggest_drive
 
-_CHECKED = ("question", "effects", "kind", "goal", "now", "unit", "expected", "at_most")
-"""What a file says of a question, which `slip plan --check` compares with the drive."""
 FILES = ("plan.toml", "plan.csv", "plan.mcap", "plan.html")
 # Fields of speed and turn by message type.
 _FIELDS: Mapping[str, tuple[str, str]] = {
@@ -63,6 +62,23 @@ def list_types(*, steered: bool) -> tuple[str, ...]:
     return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
 
 
+Amount = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
+"""In SI units; no quantity of a model is larger."""
+
+
+class Expectation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a file says of a `Question`, which `slip plan --check` compares with the drive."""
+
+    question: str
+    effects: list[str]
+    kind: Literal["separation", "presence", "interval"]
+    goal: Amount
+    expected: Amount
+    now: Amount = 0.0
+    unit: str = "1"
+    at_most: Amount = 0.0
+
+
 class StoredPlan(msgspec.Struct, frozen=True):
     """Contents of a `plan.toml` that are compared with the outcome.
 
@@ -74,7 +90,7 @@ class StoredPlan(msgspec.Struct, frozen=True):
 
     vehicle: str
     runs: list[str] = []
-    promises: list[Question] = []
+    promises: list[Expectation] = []
 
 
 def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
@@ -115,17 +131,17 @@ def read_plan(path: Path) -> StoredPlan:
     """
     file = path / FILES[0] if path.is_dir() else path
     try:
-        stored = msgspec.convert(parse_toml(read_bounded_text(file)), StoredPlan)
+        stored = convert_to(StoredPlan, parse_toml(read_bounded_text(file)))
     except OSError as error:
         what = f"the plan cannot be read ({error.strerror})"
-    except TomlError as error:
-        what = f"this is not a plan: {error}"
-    except (UnicodeDecodeError, msgspec.ValidationError):
-        what = "this is not a plan.toml that `slip plan` wrote"
+    except (TomlError, UnicodeDecodeError) as error:
+        what = f"this is not a plan.toml that `slip plan` wrote: {error}"
     else:
-        for effect in (name for answer in stored.promises for name in answer.effects):
-            find_effect(effect)
-        return stored
+        if not isinstance(stored, Fault):
+            for effect in (name for answer in stored.promises for name in answer.effects):
+                find_effect(effect)
+            return stored
+        what = f"this is not a plan.toml that `slip plan` wrote: {stored.what}"
     raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
 
 
@@ -179,7 +195,7 @@ def _format_toml(plan: Plan) -> str:
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
     for one in plan.informative:
-        lines += ["", "[[promises]]", *_format_table({name: getattr(one, name) for name in _CHECKED})]
+        lines += ["", "[[promises]]", *_format_table(pick(one, *Expectation.__struct_fields__))]
     return "\n".join(lines) + "\n"
 
 

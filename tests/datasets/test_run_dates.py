@@ -38,6 +38,20 @@ def test_dates_in_names_count_and_the_clock_that_contradicts_is_said() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "day"),
+    [
+        ("warthog_2024_8_7_11h30s30", "2024-08-07"),
+        ("2026-05-03_gravel", "2026-05-03"),
+        ("run_2024_13_40", None),
+        ("run_2024_2_31", None),
+        ("run_7", None),
+    ],
+)
+def test_dates_in_names_are_read(name: str, day: str | None) -> None:
+    assert read_day(name) == day
+
+
 @pytest.mark.parametrize("name", ["night_2023_11_13", "night_2023_11_14", "night_2023_11_15"])
 def test_a_local_date_is_no_contradiction(name: str) -> None:
     found = date_runs({name: PLACEHOLDER, "other": None})

@@ -1,5 +1,6 @@
 """`slip fleet trend`: slip and parameters over dates, and the step of each."""
 
+import json
 from collections.abc import Sequence
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
@@ -10,9 +11,11 @@ import pytest
 from comparison_store import Run, write_run
 from verbs import ask_verb
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.trend import Series, find_steps, follow_trend
+from pipeline.simulate import simulate_case
 from pipeline.store import Store
-from pipeline.store.names import read_day
 
 FIRST = date(2026, 4, 20)
 WOBBLE = (0.01, -0.02, 0.015, -0.01, 0.02, -0.015, 0.0)
@@ -111,15 +114,69 @@ def test_a_run_whose_table_is_gone_or_damaged_is_left_out_and_named(
     assert note.startswith(f"left out, {said[what]}")
 
 
-@pytest.mark.parametrize(
-    ("name", "day"),
-    [
-        ("warthog_2024_8_7_11h30s30", "2024-08-07"),
-        ("2026-05-03_gravel", "2026-05-03"),
-        ("run_2024_13_40", None),
-        ("run_2024_2_31", None),
-        ("run_7", None),
-    ],
-)
-def test_dates_in_names_are_read(name: str, day: str | None) -> None:
-    assert read_day(name) == day
+def drive(
+    folder: Path, tracks: list[float], *, duration_s: float = 40.0, grounds: tuple[str, ...] = ("tile",)
+) -> Path:
+    """Results of one log a day, each with its own effective track."""
+    for number, track in enumerate(tracks):
+        log = folder / "yard" / f"2026-05-{number + 1:02d}.mcap"
+        effects = {"effective_track": {"k": track}}
+        simulate_case("ideal_husky", effects, out=log, seed=number, duration_s=duration_s)
+        ground = grounds[number % len(grounds)]
+        analyze_log(
+            log,
+            Options(
+                out=folder / "results", report=False, diagnosis=True, overrides={"run": {"terrain": ground}}
+            ),
+        )
+    return folder / "results"
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return drive(tmp_path_factory.mktemp("three"), [1.4, 1.5, 1.9])
+
+
+def test_the_table_of_parameters_is_the_diagnosis(three: Path) -> None:
+    for manifest in Store(three).manifests():
+        told = json.loads(manifest.path("diagnosis.json").read_text(encoding="utf-8"))
+        expected = [
+            (told["input"], effect["id"], name, *(number[key] for key in ("value", "low", "high", "unit")))
+            for effect in told["effects"]
+            for name, number in effect["parameters"].items()
+        ]
+        table = manifest.read("parameters")
+        columns = ["input", "effect", "parameter", "value", "low", "high", "unit"]
+        assert table.select(pl.col(columns)).rows() == expected
+        assert ("command", "effective_track", "k") in [row[:3] for row in expected]
+        assert not table["at_bound"].any()
+
+
+def test_the_trend_follows_what_the_diagnoses_found(three: Path) -> None:
+    found = ask_verb("fleet", "trend", three, "--by", "vehicle")
+    (number,) = [one for one in found["series"] if one["quantity"] == "effective_track.k"]
+    assert [point["day"] for point in number["points"]] == ["2026-05-01", "2026-05-02", "2026-05-03"]
+    assert [point["value"] for point in number["points"]] == pytest.approx([1.4, 1.5, 1.9], rel=0.03)
+
+
+def test_results_of_a_diagnosis_without_the_table_are_made_again(tmp_path: Path) -> None:
+    """As an older version left them: the key of its diagnosis was another one."""
+    results = drive(tmp_path, [1.6])
+    store, (manifest,) = Store(results), Store(results).manifests()
+    with store.open_generation(manifest.run, "older") as generation:
+        for table in manifest.tables:
+            if table != "parameters":
+                generation.reuse_table(table)
+        for file in manifest.files:
+            if not file.endswith(".parquet"):
+                generation.reuse_file(file)
+        details = json.loads(json.dumps(dict(manifest.details)))
+        details["stages"]["diagnosis"]["key"] = "0123456789abcdef"
+        generation.commit(details)
+
+    again = analyze_log(
+        tmp_path / "yard" / "2026-05-01.mcap",
+        Options(out=results, report=False, diagnosis=True, overrides={"run": {"terrain": "tile"}}),
+    )
+    assert again.computed == ("diagnosis",)
+    assert "parameters" in again.manifest.tables

@@ -28,7 +28,7 @@ from pipeline.plan import (
     plan_files,
     wait,
 )
-from pipeline.plan.plan_files import list_types, read_plan, write_plan
+from pipeline.plan.plan_files import find_likeness, list_types, read_plan, write_plan
 from pipeline.plan.rehearsal import Rehearsal
 from pipeline.simulate import find_vehicle
 from pipeline.simulate.programs import read_played
@@ -236,3 +236,21 @@ def test_an_interrupted_plan_leaves_the_earlier_one_whole(
         write_plan(shorter, tmp_path, "another page")
 
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def draw_steps(seed: int, seconds: float) -> np.ndarray:
+    """Random steps of three seconds: forward speed and yaw rate at 10 Hz, shape (n, 2)."""
+    steps = np.random.default_rng(seed).uniform(-1.0, 1.0, (int(seconds / 3.0), 2))
+    return np.repeat(steps, 30, axis=0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_plan_is_found_wherever_it_was_played(seed: int) -> None:
+    asked, other = draw_steps(seed, 45.0), draw_steps(seed + 100, 600.0)
+    noise = np.random.default_rng(seed).normal(0.0, 0.05, (len(asked), 2))
+    assert find_likeness(asked, np.concatenate((other, asked + noise, np.zeros((50, 2))))) > 0.95
+    assert find_likeness(asked, asked) == pytest.approx(1.0)
+    # Stopped half-way, and then nothing.
+    assert find_likeness(asked, np.concatenate((asked[: len(asked) // 2], np.zeros((300, 2))))) > 0.6
+    assert find_likeness(asked, other) < 0.6
+    assert find_likeness(asked, np.zeros((400, 2))) < 0.1

@@ -14,6 +14,7 @@ from verbs import run_slip
 from pipeline.core import SlipError
 from pipeline.datasets.check import Limits, read_limits
 from pipeline.models.model_file import read_model
+from pipeline.plan.plan_files import StoredPlan, read_plan
 from pipeline.sources import VehicleSection, load_configuration
 from pipeline.sources.configuration import Configuration, list_bounds
 
@@ -40,6 +41,7 @@ def list_numbers(kind: msgspec.inspect.Type, keys: tuple[str, ...] = ()) -> Iter
 
 CONFIGURED = list(list_numbers(msgspec.inspect.type_info(Configuration)))
 LIMITED = list(list_numbers(msgspec.inspect.type_info(Limits)))
+PLANNED = list(list_numbers(msgspec.inspect.type_info(StoredPlan)))
 VEHICLES = list(list_numbers(msgspec.inspect.type_info(VehicleSection)))
 
 
@@ -61,7 +63,7 @@ def judge(error: SlipError, keys: tuple[str, ...], path: Path, what: str = "") -
 
 
 def test_every_number_has_a_finite_range() -> None:
-    for keys, bounds in [*CONFIGURED, *LIMITED, *VEHICLES]:
+    for keys, bounds in [*CONFIGURED, *LIMITED, *PLANNED, *VEHICLES]:
         assert -1e300 < bounds[0] < bounds[1] < 1e300, keys
 
 
@@ -100,6 +102,30 @@ def test_a_number_of_limits_is_used_or_refused(tmp_path: Path, which: Number, nu
     path.write_text(format_toml(keys, number))
     try:
         read_limits(path)
+    except SlipError as error:
+        judge(error, keys, path)
+    else:
+        assert least <= number <= largest
+
+
+PROMISE = {
+    "question": '"drive_lag.tau"',
+    "effects": '["drive_lag"]',
+    "kind": '"interval"',
+    "goal": 1,
+    "expected": 1,
+}
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(PLANNED), NUMBERS)
+def test_a_number_of_a_plan_is_used_or_refused(tmp_path: Path, which: Number, number: float) -> None:
+    keys, (least, largest) = which
+    path = tmp_path / "plan.toml"
+    lines = [f"{key} = {value}" for key, value in (PROMISE | {keys[-1]: number}).items()]
+    path.write_text("\n".join(['vehicle = "husky"', "[[promises]]", *lines]))
+    try:
+        read_plan(path)
     except SlipError as error:
         judge(error, keys, path)
     else:
