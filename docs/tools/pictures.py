@@ -94,7 +94,7 @@ def open_browser(work: Path) -> Iterator[Chrome]:
 def serve_results(results: Path) -> Iterator[str]:
     """The address of a workbench, with its token."""
     server = subprocess.Popen(  # noqa: S603
-        [SLIP, "serve", results, "--port", "0", "--json"],
+        [SLIP, "serve", "--results", results, "--port", "0", "--json"],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,

@@ -385,7 +385,9 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
     names = Chart.of_rows("own").mark("text", align="left", dx=12, fontWeight=600).encode(
         **axes, text="dataset:N"
     )  # fmt: skip
-    chart = layer(literature, marks, names).properties(width=720, height=520)
+    # Scales of no rows have no ends.
+    own = (marks, names) if drawn.own.height else ()
+    chart = layer(literature, *own).properties(width=720, height=520)
     note = "Hollow: mass, speed or terrain is not known well. Point at a mark to read what it is."
     words = f"{drawn.points.height} deployments of the literature and {drawn.own.height} own datasets."
     rows = {"literature": drawn.points, "own": drawn.own}

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from few import few
 from stored import hash_tree
 from verbs import ask_verb, print_verb, run_verb, slip
 
@@ -167,7 +168,7 @@ def test_no_verb_that_reads_writes_into_a_stored_run(place: Path, capsys: pytest
     assert Store(place / "results").examine().problems == ()
 
 
-@pytest.mark.parametrize("before", ["analyzed with it", "without"])
+@pytest.mark.parametrize("before", few(["analyzed with it", "without"], 2))
 def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_tables(
     place: Path,
     monkeypatch: pytest.MonkeyPatch,

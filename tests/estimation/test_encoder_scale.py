@@ -41,7 +41,8 @@ def list_ids(judged: RunDiagnosis) -> set[str]:
     return {effect.id for effect in judged.effects}
 
 
-@pytest.mark.parametrize("reads", [0.95, pytest.param(1.08, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("reads", [0.95, 1.08])
 def test_encoders_that_misread_are_named_with_the_line_that_mends_them(reads: float, tmp_path: Path) -> None:
     judged = judge(tmp_path, {"effective_track": 1.3}, reads)
     assert list_ids(judged) == {"drive_lag", "effective_track"}
@@ -67,12 +68,12 @@ def test_a_radius_alone_is_named(tmp_path: Path) -> None:
     assert list_ids(judge(tmp_path, {"wheel_radius": 1.05}, 1.0)) == {"drive_lag", "wheel_radius"}
 
 
-@pytest.mark.long
 def test_a_coincidence_is_said_and_can_be_claimed(tmp_path: Path) -> None:
     """No signal tells wheels of another radius behind a gain that undoes it from encoders that misread."""
     effects = {"wheel_radius": 1.0 / 0.95, "drive_gain": 0.95}
     judged = judge(tmp_path, effects, 1.0)
     (found,) = (one for one in judged.findings if one.id == "encoder_scale")
+    assert found.value == pytest.approx(0.95, rel=2e-3)
     assert "another radius and the drive has that gain by coincidence, scale = 1" in found.text
     claimed = judge(tmp_path, effects, 1.0, "[wheels]\nscale = 1\n")
     assert list_ids(claimed) == {"drive_lag", "wheel_radius", "drive_gain"}

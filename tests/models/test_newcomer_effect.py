@@ -77,7 +77,7 @@ def test_a_file_of_an_effect_is_all_that_it_needs(tmp_path: Path) -> None:
     assert made.returncode == 0, made.stderr
     model = tmp_path / "model.toml"
     assert run_verb("model", "new", str(model), "--vehicle", "husky_a200").returncode == 0
-    added = run_verb("model", "add", str(model), "side_pull", "--on", str(log), "--anyway")
+    added = run_verb("model", "add", str(model), "side_pull", "--on", str(log), "--anyway", cwd=tmp_path)
     assert added.returncode == 0, added.stderr
     assert find_value(model) == pytest.approx(0.1, rel=0.1)
 

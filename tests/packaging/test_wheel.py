@@ -76,7 +76,9 @@ def use_it(program: Path, wheel: Path, tmp_path: Path) -> None:
             )
             with urllib.request.urlopen(asked, timeout=60.0) as answer:  # noqa: S310
                 runs = json.load(answer)["runs"]
-            with urllib.request.urlopen(address, timeout=60.0) as page:  # noqa: S310
+            # The address is exchanged for a cookie, and leads to the page.
+            browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+            with browser.open(address, timeout=60.0) as page:
                 assert b"workbench" in page.read()
         finally:
             server.terminate()

@@ -104,7 +104,7 @@ def write_under(fault: Fault, root: Path, key: str, seed: int) -> None:
         sys.exit(REFUSED)
 
 
-@pytest.mark.parametrize("rounds", [30, pytest.param(500, marks=pytest.mark.long)])
+@pytest.mark.parametrize("rounds", [15, pytest.param(500, marks=pytest.mark.long)])
 def test_memory_and_disk_fail_at_any_moment(store: Store, rounds: int) -> None:
     server: ForkServerContext = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(["test_store_kills", "pipeline.store.parquet_tables"])

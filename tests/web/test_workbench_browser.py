@@ -376,6 +376,7 @@ def test_a_report_leads_to_all_runs_and_they_lead_back(
     chrome.wait(f"{offered}.join() === 'Map'")
     chrome.click("#pages a")
     chrome.wait("document.querySelector('h1')?.textContent === 'Deployment map'")
+    chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
     assert chrome.errors == []
 
 
