@@ -99,7 +99,7 @@ def list_promising(data: EstimationData, fitted: Fitted) -> list[Candidate]:
         effects = [one for one in candidates if one.id not in ids and one().acts_in(ids)]
         mine = [candidate for candidate in effects if path.owns(candidate())]
         matrix = Matrix(fit, mine, data.largest)
-        paying = [one for one in matrix.list_singles() if matrix.promise(one) < 0.0]
+        paying = [one for one in matrix.list_singles() if matrix.expect_change(one) < 0.0]
         promising += [by_id[matrix.trials[one.added[0]].effect.id] for one in paying[:MOST_FITTED]]
     return promising
 

@@ -293,8 +293,8 @@ class Search:
                 continue
             starts = [candidate(**values) for values in self._list_starts(candidate) if values]
             starts += effect.list_alike()
-            begun = [begin_fit(self.path, current.state.add(one), current.noise) for one in starts]
-            for one in sorted(begun, key=lambda fit: fit.expected)[: (len(begun) + 1) // 2]:
+            started = [begin_fit(self.path, current.state.add(one), current.noise) for one in starts]
+            for one in sorted(started, key=lambda fit: fit.expected)[: (len(started) + 1) // 2]:
                 fit = fit_roughly(one, _ANOTHER_STEPS)
                 fall = find_cost(fit) - find_cost(current)
                 if fall < -EQUAL and (best is None or fall < best[0]):
@@ -311,7 +311,7 @@ class Search:
 
     def _try_wholes(self, current: PathFit) -> PathFit | None:
         """The model with an effect of many numbers in the place of its special cases, where it is better."""
-        begun = list[tuple[float, str, PathFit]]()
+        started = list[tuple[float, str, PathFit]]()
         for candidate in self.candidates:
             effect = candidate()
             searched = sum(p.search is HowSearched.STARTS for p in effect.parameters)
@@ -328,10 +328,10 @@ class Search:
             fits = [begin_fit(self.path, state, current.noise) for state in states]
             expected = [one.expected + _find_price(one.state, one.numbers) for one in fits]
             cost, _, best = min(zip(expected, range(len(fits)), fits, strict=True), key=lambda one: one[:2])
-            begun.append((cost, candidate.id, best))
+            started.append((cost, candidate.id, best))
         ends = [
             (find_cost(fit), name, fit)
-            for _, name, begin in sorted(begun, key=lambda one: one[:2])[:2]
+            for _, name, begin in sorted(started, key=lambda one: one[:2])[:2]
             for fit in (fit_roughly(begin, _HARD_STEPS),)
         ]
         if not ends:
@@ -398,7 +398,7 @@ class Search:
         return None
 
     def _list_simpler(self, fit: PathFit) -> Iterator[tuple[str, ModelState]]:
-        """Models with special cases in the place of an effect, begun at its values."""
+        """Models with special cases in the place of an effect, started at its values."""
         for effect in fit.state.effects:
             if effect.id in self.given:
                 continue
@@ -457,9 +457,11 @@ class Search:
         own = _sum_blocks(final, final.noise)
         weights = _resample(own.size)
         for name in (name for name, one in judged.items() if not one.refusal):
-            brings = matrix.promise(Change().drop(name))
+            brings = matrix.expect_change(Change().drop(name))
             others = [
-                one for one in matrix.list_replacements(name) if matrix.promise(one) < _PROMISING * brings
+                one
+                for one in matrix.list_replacements(name)
+                if matrix.expect_change(one) < _PROMISING * brings
             ]
             for change in others[:_RIVALS]:
                 _, _, state = self._look(matrix, change)
@@ -599,13 +601,13 @@ def drop_linearly(fit: PathFit, name: str) -> PathFit:
     if smooth:
         moving = pick_columns(columns, smooth)
         low, high = np.array([state.find_room(free[index]) for index in smooth]).T
-        left, moved = residual, np.zeros(len(smooth))
+        unmoved, moved = residual, np.zeros(len(smooth))
         for _ in range(3):
             # Outliers are others without the effect.
             white = whiten(path, fit.noise, residual, moving)
             step = invert(white.columns.T @ white.columns) @ (white.columns.T @ white.residual)
             moved = np.clip(moved + step, low, high)
-            residual = left - combine_columns(moving, moved)
+            residual = unmoved - combine_columns(moving, moved)
     return PathFit(path, state, free, residual, columns, fit.noise)
 
 
@@ -620,9 +622,9 @@ def _find_expected_fall(fit: PathFit, change: Floats) -> float:
     """
     falls = [0.0]
     errors = zip(fit.horizon_errors, fit.path.list_horizon_errors(change), strict=True)
-    for left, moved in errors:
+    for remaining, moved in errors:
         for name in ("position", "heading"):
-            one, other = getattr(left, name), getattr(moved, name)
+            one, other = getattr(remaining, name), getattr(moved, name)
             if one.size and one.mean() + other.mean() > 0.0:
                 falls.append(1.0 - math.sqrt(one.mean() / (one.mean() + other.mean())))
     return max(falls)

@@ -147,7 +147,7 @@ class Matrix:
             gain = float(pull @ invert(mine.T @ mine) @ pull)
             if gain > best.get(trial.effect.id, (-math.inf,))[0]:
                 best[trial.effect.id] = gain, places
-        return [place for _, places in best.values() for place in places.tolist()]
+        return [column for _, places in best.values() for column in places.tolist()]
 
     def _find_bounds(self) -> tuple[Floats, Floats]:
         """Least and largest step of each column's number, infinite where none is known, shape (2, q)."""
@@ -155,10 +155,10 @@ class Matrix:
         for index, number in enumerate(self.fit.free):
             low[self._first + index], high[self._first + index] = self.fit.state.find_room(number)
         for trial, places in zip(self.trials, self._places, strict=True):
-            for name, place in zip(trial.names, places.tolist(), strict=False):
+            for name, column in zip(trial.names, places.tolist(), strict=False):
                 parameter, value = trial.effect.parameter(name), trial.effect.values[name]
                 if math.isfinite(parameter.neutral):
-                    low[place], high[place] = (bound - value for bound in parameter.bounds)
+                    low[column], high[column] = (bound - value for bound in parameter.bounds)
         return low, high
 
     def add(self, *trials: int, to: Change = Change()) -> Change:
@@ -183,7 +183,7 @@ class Matrix:
             self._costs[change] = self._solve(change)[0]
         return self._costs[change]
 
-    def promise(self, change: Change) -> float:
+    def expect_change(self, change: Change) -> float:
         """Expected change of the cost."""
         return self.measure(change) - self.measure(Change())
 
@@ -322,7 +322,7 @@ class Matrix:
             banned: names of sets that are not chosen.
         """
         start, now = self.measure(Change()), Change()
-        way, seen = list[Change](), {now}
+        steps, seen = list[Change](), {now}
         while True:
             moves = dict.fromkeys(self._list_moves(now, given))
             seen.update(moves)
@@ -330,11 +330,11 @@ class Matrix:
             if not self.measure(best) < self.measure(now) - _FALL:
                 break
             now = best
-            way.append(now)
+            steps.append(now)
         paying = sorted((one for one in seen if self.measure(one) < start - _FALL), key=self.measure)
         single = [one for one in paying if len(one.gone) <= 1 and len(one.added) <= 1]
         chosen: dict[tuple[str, ...], Change] = {}
-        for one in (*way, *self._pick(single)[:_BESIDE], *paying):
+        for one in (*steps, *self._pick(single)[:_BESIDE], *paying):
             chosen.setdefault(self.name(one), one)
         return [one for name, one in chosen.items() if name not in banned]
 

@@ -62,7 +62,11 @@ def search_formula(
     named = [one for one in _list_terms(fit) if one.id in judged and not judged[one.id].refusal]
     fall = find_cost(final) - find_cost(fit)
     matrix = outcome.matrix
-    if not named or fall < EQUAL or any(-matrix.promise(one) > _SAME * fall for one in matrix.list_singles()):
+    if (
+        not named
+        or fall < EQUAL
+        or any(-matrix.expect_change(one) > _SAME * fall for one in matrix.list_singles())
+    ):
         return outcome, None
     base = fit_path(search.path, final.state.drop(gone), noise=final.noise) if gone else final
     return replace(outcome, final=base), join_formula(named)

@@ -175,7 +175,9 @@ def test_the_matrix_knows_what_a_set_costs_before_it_is_fitted() -> None:
         effect = states[0].find(name)
         assert effect is not None
         assert next(iter(effect.values.values())) == pytest.approx(value, rel=0.25)
-    assert matrix.promise(both) < matrix.promise(Change().add(ids.index("effective_track"))) < -100.0
+    assert (
+        matrix.expect_change(both) < matrix.expect_change(Change().add(ids.index("effective_track"))) < -100.0
+    )
     assert not np.isfinite(matrix.measure(both.add(ids.index("effective_track"))))
 
 
