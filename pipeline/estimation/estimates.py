@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
+from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite, round_digits
 from pipeline.estimation.fit import PathFit, find_unlearned, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
@@ -57,7 +57,8 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         if not math.isfinite(value):
             continue
         item = known.get(f"{effect.id}.{parameter.name}")
-        low, high = (math.nan, math.nan) if item is None else item.interval
+        # As they are written: what is said of a stored answer is what was said of it at first.
+        low, high = (math.nan, math.nan) if item is None else (_write(item.low), _write(item.high))
         at_bound = stands_at_bound(value, parameter.bounds)
         own = at_bound or is_of_one_run(effect.parameters)
         another = Interval() if own else expect_another_run(parameter, value, low, high)
@@ -86,7 +87,11 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
         return Interval()
     change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
     below, above = math.hypot(value - low, change), math.hypot(high - value, change)
-    return Interval(*cut_interval(value - below, value + above, parameter.bounds))
+    return Interval(*map(_write, cut_interval(value - below, value + above, parameter.bounds)))
+
+
+def _write(value: float) -> float:
+    return round_digits(value) if math.isfinite(value) else value
 
 
 def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:

@@ -240,7 +240,13 @@ def fit_path(
     """
     fit = _begin(path, start, per_run)
     fit = replace(fit, noise=path.learn(fit.residual, noise, exact=exact))
-    return _fit_to_the_end(_differentiate(fit), exact=exact)
+    fit = _fit_to_the_end(_differentiate(fit), exact=False)
+    if not exact or not fit.free:
+        return fit
+    # Where the wide derivatives end, narrow ones find the same place to the last digit.
+    wide = fit.widths
+    fit = _fit_to_the_end(_differentiate(fit, dict.fromkeys(wide, 0.0)), exact=True)
+    return _differentiate(fit, wide)
 
 
 def go_on(fit: PathFit) -> PathFit:
@@ -352,7 +358,8 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
             cost, fallen = measure_cost(path, fit.noise, fit.state, free, fit.residual), 0.0
             most_cost = target - fit.noise.log_variance(path.steps, path.weight)
         if (fall > 0.0 or not is_fresh) and count != rough:
-            fit = _differentiate(fit, fit.widths)
+            widths = fit.widths
+            fit = _differentiate(fit, dict.fromkeys(widths, 0.0) if exact else widths)
         is_fresh, before = True, math.inf
     return fit
 
@@ -414,7 +421,8 @@ def _walk_grid(fit: PathFit, number: Free, *, exact: bool) -> PathFit:
         return fit
     state = fit.state.set(number, best)
     residual = path.find_residuals(state)
-    beyond = _descend(_differentiate(replace(fit, state=state, residual=residual), fit.widths), exact=exact)
+    moved = replace(fit, state=state, residual=residual)
+    beyond = _descend(_differentiate(moved, fit.widths), exact=exact)
     return beyond if beyond.score < fit.score else fit
 
 

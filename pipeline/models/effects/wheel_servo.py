@@ -78,7 +78,7 @@ class WheelServo(JointDrive):
             typical=0.2,
             starts=(),
             search=Search.STARTS,
-            plausible=Plausible(0.0, 3.0, "wider than the 0.15 to 0.2 s of a Warthog"),
+            plausible=Plausible(_LEAST_TAU_S, 3.0, "wider than the 0.15 to 0.2 s of a Warthog"),
             quantities=(Quantity.SPEED_LAG,),
             level=Level.VEHICLE,
         ),
