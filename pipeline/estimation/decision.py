@@ -265,7 +265,9 @@ class Search:
             for brings, _, state in looked[:_FITTED]:
                 if best is not None and not brings < _NEAR * looked[0][0]:
                     break
-                fit = _fit_under(self.path, state, noise, _STEPS, find_cost(base))
+                # A fit ends early where it cannot be cheaper than the best one.
+                least = find_cost(base) + (0.0 if best is None else min(best[0], 0.0))
+                fit = _fit_under(self.path, state, noise, _STEPS, least)
                 fall = find_cost(fit) - find_cost(base)
                 fit = replace(fit, noise=self.path.learn(fit.residual, noise))
                 if find_cost(fit) < find_cost(learned) and (best is None or fall < best[0]):

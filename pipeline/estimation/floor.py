@@ -66,6 +66,7 @@ def _explain_near(path: PathResiduals, state: ModelState, residual: Floats) -> F
     from scipy.spatial import KDTree  # noqa: PLC0415 - heavy
 
     features = np.concatenate([_list_moments(path, state, run) for run in range(len(path.residuals_by_run))])
+    features = features[:, np.ptp(features, axis=0) > 0.0]
     fold = np.random.default_rng(0).permutation(int(path.block.max()) + 1)[path.block] % FOLDS
     rest = np.array(residual)
     for number in range(FOLDS):
@@ -88,7 +89,7 @@ def _list_moments(path: PathResiduals, state: ModelState, run: int) -> Floats:
     pairs = [(ideal, late) for late in _INPUT_S] + [(moved, late) for late in _MOTION_S]
     signals = [(getattr(velocity, name), late) for velocity, late in pairs for name in ("x", "y", "w")]
     columns = [np.interp(middle - late, one.grid.times, signal) for signal, late in signals]
-    return np.column_stack([column for column in columns if np.ptp(column) > 0.0])
+    return np.column_stack(columns)
 
 
 def _measure(path: PathResiduals, residual: Floats) -> dict[str, Floats]:
