@@ -29,6 +29,8 @@ _ENOUGH = 0.05
 """Fall of chi-square below which a step is not worth taking."""
 _SETTLED = 1e-8
 """The same for a model that is written: it ends at the same values from every start."""
+_ASTRAY = 100.0
+"""Expected fall over the least so far, above which steps lead nowhere."""
 _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
 _CONVERGING = 0.3
@@ -240,28 +242,43 @@ def fit_path(
     """
     fit = _begin(path, start, per_run)
     fit = replace(fit, noise=path.learn(fit.residual, noise, exact=exact))
-    fit = _fit_to_the_end(_differentiate(fit), exact=False)
-    if not exact or not fit.free:
-        return fit
-    # Where the wide derivatives end, narrow ones find the same place to the last digit.
-    wide = fit.widths
-    fit = _fit_to_the_end(_differentiate(fit, dict.fromkeys(wide, 0.0)), exact=True)
-    return _differentiate(fit, wide)
+    fit = _fit_to_the_end(_differentiate(fit))
+    return _settle(fit) if exact and fit.smooth else fit
+
+
+def _settle(fit: PathFit) -> PathFit:
+    """The place where no derivative pulls any more, by Newton's steps: a fit ends there from every start.
+
+    The cost has many dents where limits and friction begin to act; what wide derivatives see has none.
+    """
+    path, best, least = fit.path, fit, math.inf
+    for _ in range(_MOST_STEPS):
+        moving, step, expected = _solve(fit, _LOOSEST)
+        if expected < least:
+            best, least = fit, expected
+        if expected < _SETTLED or expected > _ASTRAY * least:
+            break
+        state = fit.state.move(moving, step)
+        residual = path.find_residuals(state)
+        noise = path.learn(residual, fit.noise, exact=True)
+        moved = replace(fit, state=state, residual=residual, noise=noise)
+        fit = _differentiate(moved, fit.widths)
+    return replace(best, state=best.state.centred)
 
 
 def go_on(fit: PathFit) -> PathFit:
     """A rough fit taken to its end, with the noise of its own residuals."""
     learned = replace(fit, noise=fit.path.learn(fit.residual, fit.noise))
-    return _fit_to_the_end(_differentiate(learned, fit.widths), exact=False)
+    return _fit_to_the_end(_differentiate(learned, fit.widths))
 
 
-def _fit_to_the_end(fit: PathFit, *, exact: bool) -> PathFit:
+def _fit_to_the_end(fit: PathFit) -> PathFit:
     if not fit.free:
         return fit
-    fit = _descend(fit, exact=exact)
+    fit = _descend(fit)
     for _ in range(_MOST_WALKS if len(fit.smooth) < len(fit.free) else 0):
         before = fit.score
-        fit = _walk_grids(fit, exact=exact)
+        fit = _walk_grids(fit)
         if before - fit.score < _ENOUGH:
             break
     return replace(fit, state=fit.state.centred)
@@ -294,11 +311,11 @@ def _differentiate(fit: PathFit, widths: Mapping[FreeKey, float] | None = None) 
     return replace(fit, columns=fit.path.differentiate(fit.state, fit.residual, fit.free, widths))
 
 
-def _walk_grids(fit: PathFit, *, exact: bool = False) -> PathFit:
+def _walk_grids(fit: PathFit) -> PathFit:
     """Search each number without derivatives once; see `_walk_grid`."""
     for number in fit.free:
         if not number.is_smooth:
-            fit = _walk_grid(fit, number, exact=exact)
+            fit = _walk_grid(fit, number)
     return fit
 
 
@@ -310,7 +327,7 @@ def measure_cost(
     return float((path.weight * huber_cost(innovations)).sum()) + path.prior.cost(state, free)
 
 
-def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float = math.inf) -> PathFit:
+def _descend(fit: PathFit, *, rough: int = 0, target: float = math.inf) -> PathFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
 
     Derivatives are computed anew after a step that was news, and where steps without become hardly smaller:
@@ -318,12 +335,11 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
 
     Args:
         fit: where to begin.
-        exact: see `fit_path`.
         rough: most steps of a rough descent, by the noise as it is; its derivatives are those before the last
             step. 0 for a whole one.
         target: see `fit_path`.
     """
-    path, free, enough = fit.path, fit.free, _SETTLED if exact else _ENOUGH
+    path, free = fit.path, fit.free
     most = rough or _MOST_STEPS
     unlearned = find_unlearned(path)
     damping, fallen, is_fresh, before = _LOOSEST, 0.0, True, math.inf
@@ -334,32 +350,27 @@ def _descend(fit: PathFit, *, exact: bool = False, rough: int = 0, target: float
         if is_fresh and damping <= _LOOSEST and cost - _MORE_THAN_EXPECTED * expected_fall > most_cost:
             break
         fall = 0.0
-        if expected_fall >= enough and (is_fresh or expected_fall < _CONVERGING * before):
+        if expected_fall >= _ENOUGH and (is_fresh or expected_fall < _CONVERGING * before):
             state = fit.state.move(moving, step)
             residual = path.find_residuals(state)
             fall = cost - measure_cost(path, fit.noise, state, free, residual)
-        # Numbers that must converge do so with the noise as it is, and then with it.
-        most_fallen = 0.0 if exact and is_fresh and not fall > 0.0 else unlearned
         if fall > 0.0:
             fit, cost, fallen = replace(fit, state=state, residual=residual), cost - fall, fallen + fall
             damping = max(damping / 30.0, 1e-9)
             if fall <= _NEWS:
                 is_fresh, before = False, expected_fall
                 continue
-        elif is_fresh and expected_fall >= enough and damping <= _STIFFEST:
+        elif is_fresh and expected_fall >= _ENOUGH and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
-            # Where limits are met, the cost is rough: there, no place is better to the last digit.
-            enough = _ENOUGH if expected_fall < _NEWS else enough
             continue
-        elif (is_fresh or (expected_fall < enough and not exact)) and fallen <= most_fallen:
+        elif (is_fresh or expected_fall < _ENOUGH) and fallen <= unlearned:
             break
-        if fallen > most_fallen and not rough:
-            fit = replace(fit, noise=path.learn(fit.residual, fit.noise, exact=exact))
+        if fallen > unlearned and not rough:
+            fit = replace(fit, noise=path.learn(fit.residual, fit.noise))
             cost, fallen = measure_cost(path, fit.noise, fit.state, free, fit.residual), 0.0
             most_cost = target - fit.noise.log_variance(path.steps, path.weight)
         if (fall > 0.0 or not is_fresh) and count != rough:
-            widths = fit.widths
-            fit = _differentiate(fit, dict.fromkeys(widths, 0.0) if exact else widths)
+            fit = _differentiate(fit, fit.widths)
         is_fresh, before = True, math.inf
     return fit
 
@@ -397,7 +408,7 @@ def _is_pushed_out(state: ModelState, number: Free, pull: float) -> bool:
     return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
 
 
-def _walk_grid(fit: PathFit, number: Free, *, exact: bool) -> PathFit:
+def _walk_grid(fit: PathFit, number: Free) -> PathFit:
     """Search a number on ever finer grids, the others adapted linearly; then all of them are fitted."""
     path, noise, smooth = fit.path, fit.noise, fit.smooth
     columns = pick_columns(fit.columns, smooth)
@@ -422,7 +433,7 @@ def _walk_grid(fit: PathFit, number: Free, *, exact: bool) -> PathFit:
     state = fit.state.set(number, best)
     residual = path.find_residuals(state)
     moved = replace(fit, state=state, residual=residual)
-    beyond = _descend(_differentiate(moved, fit.widths), exact=exact)
+    beyond = _descend(_differentiate(moved, fit.widths))
     return beyond if beyond.score < fit.score else fit
 
 
