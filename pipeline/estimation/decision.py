@@ -191,6 +191,12 @@ class Search:
     least_t: float = LEAST_T
     _tried: set[object] = field(default_factory=set, init=False)
     _banned: set[tuple[str, ...]] = field(default_factory=set, init=False)
+    _excluded: set[str] = field(default_factory=set, init=False)
+
+    @property
+    def _allowed(self) -> list[Candidate]:
+        """Candidates but for those that turned out impossible, or unproven beside others."""
+        return [one for one in self.candidates if one.id not in self._excluded]
 
     def run(self, start: ModelState) -> SearchResult:
         """Search from a model."""
@@ -211,7 +217,7 @@ class Search:
     def make_matrix(self, fit: PathFit) -> Matrix:
         """What sets of effects near a model would explain; special cases of its effects are in it already."""
         known = {*fit.ids}.union(*(effect.contains for effect in fit.state.effects))
-        acting = [one for one in self.candidates if one.id not in known and one().acts_in(fit.ids)]
+        acting = [one for one in self._allowed if one.id not in known and one().acts_in(fit.ids)]
         return Matrix(fit, acting, self.conditions.largest)
 
     def search_possible(self, first: PathFit) -> PathFit:
@@ -222,7 +228,7 @@ class Search:
             if not wrong:
                 break
             # What cannot be would keep what is there from the set.
-            self.candidates = tuple(one for one in self.candidates if one.id not in wrong)
+            self._excluded |= wrong
             current = self._climb(fit_path(self.path, current.state.drop(wrong), noise=current.noise))
         return current
 
@@ -290,7 +296,7 @@ class Search:
         """The same set from other starts of effects with several valleys; None where none is cheaper."""
         best: tuple[float, PathFit] | None = None
         for effect in current.state.effects:
-            candidate = next((one for one in self.candidates if one.id == effect.id), None)
+            candidate = next((one for one in self._allowed if one.id == effect.id), None)
             if candidate is None or sum(one.effect == effect.id for one in current.free) < _FEWEST_STARTS:
                 continue
             starts = [candidate(**values) for values in self._list_starts(candidate) if values]
@@ -314,7 +320,7 @@ class Search:
     def _try_wholes(self, current: PathFit) -> PathFit | None:
         """The model with an effect of many numbers in the place of its special cases, where it is better."""
         started = list[tuple[float, str, PathFit]]()
-        for candidate in self.candidates:
+        for candidate in self._allowed:
             effect = candidate()
             searched = sum(p.search is HowSearched.STARTS for p in effect.parameters)
             if not effect.contains or candidate.id in current.ids or searched < _FEWEST_STARTS:
@@ -385,7 +391,7 @@ class Search:
 
     def _collapse(self, fit: PathFit) -> ModelState | None:
         """The model with what a degenerate effect has become in its place, or nothing; None without one."""
-        known = {one.id for one in self.candidates}
+        known = {one.id for one in self._allowed}
         for effect in fit.state.effects:
             if effect.id not in self.given and effect.is_neutral:
                 return fit.state.drop([effect.id])
@@ -423,7 +429,7 @@ class Search:
 
     def _list_cases(self, effect: Effect, ids: Collection[str]) -> Iterator[Effect]:
         """Special cases of an effect at its values: of equal names its own, of time constants their mean."""
-        for candidate in self.candidates:
+        for candidate in self._allowed:
             if candidate.id not in effect.contains or candidate.id in ids:
                 continue
             names = {p.name for p in candidate.parameters}
@@ -435,14 +441,18 @@ class Search:
                 yield candidate(tau=sum(taus) / len(taus))
 
     def name_all(self, fit: PathFit) -> tuple[PathFit, dict[str, Judged]]:
-        """The model without effects that are not proven beside its others, and how each was judged."""
+        """The model without effects that are not proven beside its others, and how each was judged.
+
+        What goes may have kept out what is there: the search goes on without it.
+        """
         while True:
             judged = self.judge_all(fit)
             refused = [one for one in judged.values() if not one.is_proven]
             if not refused:
                 return fit, judged
-            least = min(refused, key=lambda one: (one.frequency, one.t, one.effect))
-            fit = fit_path(self.path, fit.state.drop([least.effect]), noise=fit.noise)
+            least = min(refused, key=lambda one: (one.frequency, one.t, one.effect)).effect
+            self._excluded.add(least)
+            fit = self.search_possible(fit_path(self.path, fit.state.drop([least]), noise=fit.noise))
 
     def judge_all(self, fit: PathFit) -> dict[str, Judged]:
         """How each effect of a model is judged, but for given ones and those too small for a name."""
