@@ -136,8 +136,8 @@ def test_a_rate_limit_follows_its_input_step_by_step() -> None:
 def test_an_uneven_lag_agrees_with_stepping_through_it(
     levels: list[float], taus: tuple[float, float], start: float
 ) -> None:
-    # With a hundred steps a cell, passing zero within one of them costs more than is asked for below.
-    cells, fine, width = 20, 400, 0.02
+    # With hundreds of steps a cell, passing zero within one of them costs more than is asked for below.
+    cells, fine, width = 20, 1000, 0.02
     signal = np.repeat(levels, cells)
     lagged = lag_unevenly(signal, taus, width, resets_at([0], signal.size, [start]), np.array([start]))
     decays = [math.exp(-width / fine / tau) for tau in taus]
