@@ -53,7 +53,10 @@ def search_formula(
     wheels = not others and first.context.vehicle.kind == "differential"
     final, terms = outcome.final, list_terms(sideways=sideways, wheels=wheels)
     wide = replace(search, candidates=terms, least_t=math.sqrt(LEAST_T**2 + 2.0 * math.log(SHAPES)))
-    fit, judged = wide.name_all(wide.search_possible(final))
+    beside = wide.search_possible(final)
+    if not _list_terms(beside):
+        return outcome, None
+    fit, judged = wide.name_all(beside)
     if _list_terms(fit) and len(fit.ids) > len(_list_terms(fit)) + len(search.given):
         # What an effect and a term say together, another term may say alone.
         other = wide.name_all(wide.search_possible(outcome.start))
