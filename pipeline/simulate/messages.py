@@ -5,6 +5,7 @@ What says when and with which quantities a topic is sent is an entry of `SOURCES
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -138,9 +139,9 @@ def _of_imu(run: SimulatedRun) -> Sampled:
     return imu.time_s, imu.time_s + LATE_S, series
 
 
-def _of_decoy(run: SimulatedRun) -> Sampled:
+def of_wishes(run: SimulatedRun, purpose: str) -> Sampled:
     """Commands that never reach the controller."""
-    wished = make_wishes(run.scenario, "decoy")
+    wished = make_wishes(run.scenario, purpose)
     series = {"speed": wished.speed_mps, "yaw_rate": wished.turn, "sideways": wished.sideways}
     return wished.time_s, wished.time_s, series
 
@@ -192,7 +193,7 @@ SOURCES: dict[str, Callable[[SimulatedRun], Sampled]] = {
     "tracking": _of_tracking,
     "relocalization": _of_relocalization,
     "imu": _of_imu,
-    "decoy": _of_decoy,
+    "decoy": partial(of_wishes, purpose="decoy"),
     "odometry": of_odometry,
     "state": _of_state,
     "once": _once,
