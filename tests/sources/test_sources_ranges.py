@@ -1,7 +1,7 @@
 """Every number that a user writes has a range: a value is used, or refused in one line that names it."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -62,6 +62,19 @@ def judge(error: SlipError, keys: tuple[str, ...], path: Path, what: str = "") -
     assert len(str(error)) < 1000
 
 
+def use_or_refuse(
+    read: Callable[[], object], path: Path, which: Number, number: float, what: str = ""
+) -> None:
+    """Read a file with a number: within its range it is used, else refused in one line."""
+    keys, (least, largest) = which
+    try:
+        read()
+    except SlipError as error:
+        judge(error, keys, path, what)
+    else:
+        assert least <= number <= largest
+
+
 def test_every_number_has_a_finite_range() -> None:
     for keys, bounds in [*CONFIGURED, *LIMITED, *PLANNED, *VEHICLES]:
         assert -1e300 < bounds[0] < bounds[1] < 1e300, keys
@@ -84,28 +97,18 @@ def test_a_number_of_a_configuration_is_used_or_refused(tmp_path: Path, which: N
     keys, (least, largest) = which
     path = tmp_path / "run.toml"
     path.write_text(format_toml(keys, number))
-    try:
-        load_configuration(tmp_path / "run.mcap")
-    except SlipError as error:
-        finite = isinstance(number, float) and math.isfinite(number)
-        text = f"{number:g} is outside its range, {least:g} to {largest:g}" if finite else ""
-        judge(error, keys, path, text)
-    else:
-        assert least <= number <= largest
+    finite = isinstance(number, float) and math.isfinite(number)
+    what = f"{number:g} is outside its range, {least:g} to {largest:g}" if finite else ""
+    use_or_refuse(lambda: load_configuration(tmp_path / "run.mcap"), path, which, number, what)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(LIMITED), NUMBERS)
 def test_a_number_of_limits_is_used_or_refused(tmp_path: Path, which: Number, number: float) -> None:
-    keys, (least, largest) = which
+    keys, _ = which
     path = tmp_path / "limits.toml"
     path.write_text(format_toml(keys, number))
-    try:
-        read_limits(path)
-    except SlipError as error:
-        judge(error, keys, path)
-    else:
-        assert least <= number <= largest
+    use_or_refuse(lambda: read_limits(path), path, which, number)
 
 
 PROMISE = {
@@ -120,16 +123,11 @@ PROMISE = {
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(PLANNED), NUMBERS)
 def test_a_number_of_a_plan_is_used_or_refused(tmp_path: Path, which: Number, number: float) -> None:
-    keys, (least, largest) = which
+    keys, _ = which
     path = tmp_path / "plan.toml"
     lines = [f"{key} = {value}" for key, value in (PROMISE | {keys[-1]: number}).items()]
     path.write_text("\n".join(['vehicle = "husky"', "[[promises]]", *lines]))
-    try:
-        read_plan(path)
-    except SlipError as error:
-        judge(error, keys, path)
-    else:
-        assert least <= number <= largest
+    use_or_refuse(lambda: read_plan(path), path, which, number)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -137,15 +135,10 @@ def test_a_number_of_a_plan_is_used_or_refused(tmp_path: Path, which: Number, nu
 def test_a_number_of_a_models_vehicle_is_used_or_refused(
     tmp_path: Path, which: Number, number: float
 ) -> None:
-    keys, (least, largest) = which
+    keys, _ = which
     path = tmp_path / "model.toml"
     path.write_text(f'[vehicle]\npreset = "husky_a200"\n{format_toml(keys, number)}')
-    try:
-        read_model(path)
-    except SlipError as error:
-        judge(error, keys, path)
-    else:
-        assert least <= number <= largest
+    use_or_refuse(lambda: read_model(path), path, which, number)
 
 
 PARAMETER = ["value", "low", "high", "bounds", "neutral"]
