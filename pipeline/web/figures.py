@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -16,10 +17,12 @@ from pipeline.results import RunDiagnosis
 from pipeline.stages import find_residual_modulus
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
+    from pipeline.core import Floats
+    from pipeline.report.motion_view import MotionView
+    from pipeline.results import SlipBudget
     from pipeline.store import Manifest
-    from pipeline.web.prepared import Shown
 
 TABS: Mapping[str, tuple[str, ...]] = {
     "first": ("paths", "stretch"),
@@ -31,6 +34,25 @@ TABS: Mapping[str, tuple[str, ...]] = {
 """Figures of every tab, in order."""
 _COLOURED = {"trajectory": slip_figures.format_map, "command_space": slip_figures.format_cells}
 _LEFT = "Colours: residual slip of the model."
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A model on a run, as it is shown.
+
+    Attributes:
+        view: rows to draw.
+        where: regions with most of its error, as text of `slip diagnose`.
+        largest: span with the largest part of its squared error over 2 s [s]; None without predictions.
+        predict: function for its body velocities at times of aligned poses [s], shape (n, 3).
+        apportion: function for its budgets by cause, given the length scale of the slip modulus [m].
+    """
+
+    view: MotionView
+    where: list[str]
+    largest: tuple[float, float] | None
+    predict: Callable[[Floats], Floats]
+    apportion: Callable[[float], Sequence[SlipBudget]]
 
 
 class Figures:

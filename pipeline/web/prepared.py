@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 
@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline import results
-from pipeline.core import Floats, Newest
+from pipeline.core import Newest
 from pipeline.estimation import Errors, Estimates, EstimationData, Input, ModelState, choose_input
 from pipeline.estimation.apportion import apportion, find_half
 from pipeline.estimation.error_regions import map_errors, pick_regions
@@ -26,7 +26,7 @@ from pipeline.results import RunDiagnosis, SlipBudget, list_excess, read_result
 from pipeline.run import HORIZON_S, MotionRun, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
 from pipeline.store import Manifest
-from pipeline.web.figures import Figures
+from pipeline.web.figures import Figures, Shown
 from pipeline.words import describe_region
 
 _MOST_FITS = 60
@@ -42,25 +42,6 @@ class Judged:
     def estimates(self) -> Estimates:
         """Parameters with their 95 % intervals."""
         return estimate_intervals(self.step.fitted) if self.step.effects else NOTHING
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A model on a run, as it is shown.
-
-    Attributes:
-        view: rows to draw.
-        where: regions with most of its error, as text of `slip diagnose`.
-        largest: span with the largest part of its squared error over 2 s [s]; None without predictions.
-        predict: function for its body velocities at times of aligned poses [s], shape (n, 3).
-        apportion: function for its budgets by cause, given the length scale of the slip modulus [m].
-    """
-
-    view: MotionView
-    where: list[str]
-    largest: tuple[float, float] | None
-    predict: Callable[[Floats], Floats]
-    apportion: Callable[[float], Sequence[SlipBudget]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from pipeline.models import Effect, Model, ModelFile, find_effect, name_term
 from pipeline.results import RunDiagnosis, read_model, read_result, read_suggestion
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
-from pipeline.web.prepared import Judged, PreparedRun, Shown
+from pipeline.web.figures import Shown
+from pipeline.web.prepared import Judged, PreparedRun
 from pipeline.words import format_refusals
 
 _MOST_STEPS = 200
