@@ -8,6 +8,7 @@ the place of an effect. What stays has a name where `judge` accepts it, and noth
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -264,9 +265,10 @@ class Search:
         noise = matrix.noise
         base = _fit_under(self.path, current.state, noise, _FEW_STEPS)
         learned = replace(current, noise=self.path.learn(current.residual, current.noise))
-        sets = iter(matrix.choose(self.given, self._banned))
+        own, sets = _measure_under(matrix.fit, noise), iter(matrix.choose(self.given, self._banned))
         for _ in range(_LOOKS):
-            looked = sorted(self._look(matrix, one) for one in islice(sets, _LOOKED))
+            looks = (self._look(matrix, one) for one in islice(sets, _LOOKED))
+            looked = sorted((cost - own, name, state) for cost, name, state in looks)
             best: tuple[float, PathFit] | None = None
             for brings, _, state in looked[:_FITTED]:
                 if best is not None and not brings < _NEAR * looked[0][0]:
@@ -283,18 +285,18 @@ class Search:
         return None
 
     def _look(self, matrix: Matrix, change: Change) -> tuple[float, tuple[str, ...], ModelState]:
-        """What a set brings at first sight, at the best of its starts."""
+        """Cost of a set at first sight, at the best of its starts, with its name."""
         looks: list[tuple[float, int, ModelState]] = []
         for state in matrix.list_states(change):
             free = self.path.list_free(state)
             cost = measure_cost(self.path, matrix.noise, state, free, self.path.find_residuals(state))
             looks.append((cost + _find_price(state, len(free)), len(looks), state))
         cost, _, state = min(looks, key=lambda one: one[:2])
-        return cost - _measure_under(matrix.fit, matrix.noise), matrix.name(change), state
+        return cost, matrix.name(change), state
 
     def _start_again(self, current: PathFit) -> PathFit | None:
         """The same set from other starts of effects with several valleys; None where none is cheaper."""
-        best: tuple[float, PathFit] | None = None
+        fits = list[PathFit]()
         for effect in current.state.effects:
             candidate = next((one for one in self._allowed if one.id == effect.id), None)
             if candidate is None or sum(one.effect == effect.id for one in current.free) < _FEWEST_STARTS:
@@ -302,12 +304,11 @@ class Search:
             starts = [candidate(**values) for values in self._list_starts(candidate) if values]
             starts += effect.list_alike()
             started = [begin_fit(self.path, current.state.add(one), current.noise) for one in starts]
-            for one in sorted(started, key=lambda fit: fit.expected)[: (len(started) + 1) // 2]:
-                fit = fit_roughly(one, _ANOTHER_STEPS)
-                fall = find_cost(fit) - find_cost(current)
-                if fall < -EQUAL and (best is None or fall < best[0]):
-                    best = fall, fit
-        return None if best is None else self._take(best[1], current, EQUAL)
+            better = sorted(started, key=lambda fit: fit.expected)[: (len(started) + 1) // 2]
+            fits += [fit_roughly(one, _ANOTHER_STEPS) for one in better]
+        best = min(fits, key=find_cost, default=current)
+        is_cheaper = find_cost(best) - find_cost(current) < -EQUAL
+        return self._take(best, current, EQUAL) if is_cheaper else None
 
     def _list_starts(self, candidate: Candidate) -> list[dict[str, float]]:
         return list_starts(candidate, self.conditions.largest)
@@ -337,20 +338,17 @@ class Search:
             expected = [one.expected + _find_price(one.state, one.numbers) for one in fits]
             cost, _, best = min(zip(expected, range(len(fits)), fits, strict=True), key=lambda one: one[:2])
             started.append((cost, candidate.id, best))
-        ends = [
-            (find_cost(fit), name, fit)
-            for _, name, begin in sorted(started, key=lambda one: one[:2])[:2]
-            for fit in (fit_roughly(begin, _HARD_STEPS),)
-        ]
-        if not ends:
+        if not started:
             return None
-        cost, name, fit = min(ends, key=lambda one: one[:2])
+        nearest = sorted(started, key=lambda one: one[:2])[:2]
+        ends = [(fit_roughly(begin, _HARD_STEPS), name) for _, name, begin in nearest]
+        fit, name = min(ends, key=lambda one: (find_cost(one[0]), one[1]))
         whole = fit.state.find(name)
         if whole is None or not is_nameable(whole, self.conditions):
             return None
         without = [one for one in current.ids if one in (*whole.contains, *whole.companions)]
         explained = _measure_under(current, current.noise, without) - _measure_under(current, current.noise)
-        if cost - find_cost(current) > max(_WHOLE_NEAR, _WHOLE_SHARE * explained):
+        if find_cost(fit) - find_cost(current) > max(_WHOLE_NEAR, _WHOLE_SHARE * explained):
             return None
         taken = self._take(fit, current, _WHOLE_FALL)
         whole = None if taken is None else taken.state.find(name)
@@ -508,6 +506,7 @@ def _measure_under(fit: PathFit, noise: Noise, without: Collection[str] = ()) ->
     return measure_cost(path, noise, state, free, residual) + _find_price(state, len(free))
 
 
+@functools.lru_cache(maxsize=8)
 def _resample(count: int) -> Floats:
     """How often each block is in each resampled recording, shape (draws, blocks)."""
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=_DRAWS)
@@ -572,7 +571,7 @@ def judge(
         conditions: what the runs can show.
         least_t: standard errors that it must be from none.
     """
-    path, base = fit.path, drop_linearly(fit, effect.id)
+    path, base = fit.path, _drop_linearly(fit, effect.id, matrix.without[effect.id])
     gone = Change().drop(effect.id)
     brings = matrix.sum_blocks(gone) - matrix.sum_blocks(Change())
     price = matrix.find_price(Change()) - matrix.find_price(gone)
@@ -603,10 +602,9 @@ def judge(
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
 
 
-def drop_linearly(fit: PathFit, name: str) -> PathFit:
-    """A model without one of its effects, its other numbers adapted by one linear step."""
+def _drop_linearly(fit: PathFit, name: str, residual: Floats) -> PathFit:
+    """A model without one of its effects, which leaves a residual, its other numbers adapted linearly."""
     path, state = fit.path, fit.state.drop([name])
-    residual = path.find_residuals(state)
     places = [index for index, number in enumerate(fit.free) if number.effect != name]
     free, columns = tuple(fit.free[index] for index in places), pick_columns(fit.columns, places)
     smooth = [index for index, number in enumerate(free) if number.is_smooth]

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import FOLDS
-from pipeline.estimation.model_state import combine_columns, flatten, make_columns, pick_columns
-from pipeline.estimation.noise import NO_NOISE, find_weights, huber_cost
+from pipeline.estimation.model_state import combine_columns, flatten, pick_columns
+from pipeline.estimation.noise import find_weights, huber_cost
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -240,9 +240,10 @@ def fit_path(
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
     """
-    fit = _begin(path, start, per_run)
-    fit = replace(fit, noise=path.learn(fit.residual, noise, exact=exact))
-    fit = _fit_to_the_end(_differentiate(fit))
+    free, residual = path.list_free(start, per_run), path.find_residuals(start)
+    learned = path.learn(residual, noise, exact=exact)
+    columns = path.differentiate(start, residual, free)
+    fit = _fit_to_the_end(PathFit(path, start, free, residual, columns, learned))
     return _settle(fit) if exact and fit.smooth else fit
 
 
@@ -286,7 +287,8 @@ def _fit_to_the_end(fit: PathFit) -> PathFit:
 
 def begin_fit(path: PathResiduals, start: ModelState, noise: Noise) -> PathFit:
     """A fit before its first step."""
-    return _differentiate(replace(_begin(path, start), noise=noise))
+    free, residual = path.list_free(start), path.find_residuals(start)
+    return PathFit(path, start, free, residual, path.differentiate(start, residual, free), noise)
 
 
 def fit_roughly(fit: PathFit, steps: int, target: float = math.inf) -> PathFit:
@@ -300,13 +302,7 @@ def fit_roughly(fit: PathFit, steps: int, target: float = math.inf) -> PathFit:
     return _walk_grids(_descend(fit, rough=steps, target=target)) if fit.free else fit
 
 
-def _begin(path: PathResiduals, start: ModelState, per_run: Sequence[str] = ()) -> PathFit:
-    """A fit without derivatives and noise."""
-    free, residual = path.list_free(start, per_run), path.find_residuals(start)
-    return PathFit(path, start, free, residual, make_columns(residual.shape[0], len(free)), NO_NOISE)
-
-
-def _differentiate(fit: PathFit, widths: Mapping[FreeKey, float] | None = None) -> PathFit:
+def _differentiate(fit: PathFit, widths: Mapping[FreeKey, float]) -> PathFit:
     """The fit with the derivatives of its place."""
     return replace(fit, columns=fit.path.differentiate(fit.state, fit.residual, fit.free, widths))
 

@@ -87,12 +87,14 @@ class Matrix:
         fit: the model with the noise of what no candidate explains. That of its own residuals takes a slow
             hidden effect for a slow disturbance, and hides it.
         trials: starts of the candidates.
+        without: residuals of the model without each of its effects, shape (n, 3), by id.
     """
 
     def __init__(self, fit: PathFit, candidates: Sequence[Candidate], largest: Largest) -> None:
         path, state = fit.path, fit.state
         self.trials = list_all_trials(fit, candidates, largest)
-        drops = [path.find_residuals(state.drop([name])) - fit.residual for name in fit.ids]
+        self.without = {name: path.find_residuals(state.drop([name])) for name in fit.ids}
+        drops = [residual - fit.residual for residual in self.without.values()]
         columns = [fit.residual[:, :, None], *([stack_columns(drops)] if drops else []), fit.columns]
         columns += [trial.columns for trial in self.trials]
         places = np.split(np.arange(sum(map(_width, columns))), np.cumsum([*map(_width, columns)])[:-1])
@@ -112,7 +114,7 @@ class Matrix:
         self._white: Floats = white / self._deviation
         self._gram: Floats = self._white.T @ self._white
         self._bounds = self._find_bounds()
-        self._costs: dict[Change, float] = {}
+        self._solved: dict[Change, tuple[float, Floats]] = {}
 
     @property
     def noise(self) -> Noise:
@@ -170,18 +172,17 @@ class Matrix:
         stay = [name for name in self.fit.ids if name not in change.gone]
         return tuple(sorted([*stay, *(self.trials[index].effect.id for index in change.added)]))
 
-    def _price(self, change: Change) -> float:
+    def find_price(self, change: Change) -> float:
+        """What the numbers and unusual effects of a set must bring."""
         stay = [effect for effect in self.fit.state.effects if effect.id not in change.gone]
-        ids = {*(effect.id for effect in stay)} | (set() if self._is_delayed(change) else {""})
+        ids = {*(effect.id for effect in stay)} | (set() if self._brings_dead_time(change) else {""})
         numbers = sum(number.effect in ids for number in self.fit.free)
         own = PRICE * numbers + sum(map(find_rarity, stay))
         return own + sum(self.trials[index].price for index in change.added)
 
     def measure(self, change: Change) -> float:
         """Expected cost of a set with its price; infinite where it cannot be."""
-        if change not in self._costs:
-            self._costs[change] = self._solve(change)[0]
-        return self._costs[change]
+        return self._solve(change)[0]
 
     def expect_change(self, change: Change) -> float:
         """Expected change of the cost."""
@@ -189,14 +190,14 @@ class Matrix:
 
     def _list_columns(self, change: Change) -> Ints:
         ids = [name for name in self.fit.ids if name not in change.gone]
-        ids += [] if self._is_delayed(change) else [""]
+        ids += [] if self._brings_dead_time(change) else [""]
         own = [self._first + index for name in ids for index in self._own.get(name, ())]
         return np.array([*own, *(c for i in change.added for c in self._moved[i].tolist())], dtype=np.int64)
 
-    def _is_delayed(self, change: Change) -> bool:
+    def _brings_dead_time(self, change: Change) -> bool:
         """Whether a delay of the commands comes that takes over those of the encoders."""
         late = (self.trials[index].effect.late for index in change.added)
-        return self.fit.path.reads_late and Late.COMMANDS in late
+        return not self.fit.path.is_delayed and Late.COMMANDS in late
 
     def _aim(self, change: Change) -> Floats:
         """What the columns of a set must explain: the residual with what goes taken out, shape (q,)."""
@@ -209,12 +210,17 @@ class Matrix:
 
     def _solve(self, change: Change) -> tuple[float, Floats]:
         """Expected cost of a set, and the step of its columns."""
+        if change not in self._solved:
+            self._solved[change] = self._solve_anew(change)
+        return self._solved[change]
+
+    def _solve_anew(self, change: Change) -> tuple[float, Floats]:
         trials = [self.trials[index] for index in change.added]
         if any(self._is_in(one, change) for one in trials):
             return math.inf, np.zeros(0)
         columns, aim = self._list_columns(change), self._aim(change)
         pulled = self._gram @ aim
-        cost = float(aim @ pulled) + self._price(change)
+        cost = float(aim @ pulled) + self.find_price(change)
         if not columns.size:
             return cost, np.zeros(0)
         normal = self._gram[np.ix_(columns, columns)]
@@ -308,11 +314,9 @@ class Matrix:
 
     def list_replacements(self, name: str) -> list[Change]:
         """The best start of each candidate in the place of an effect, the best candidate first."""
-        best: dict[str, Change] = {}
         changes = [self.add(index, to=Change().drop(name)) for index in range(len(self.trials))]
-        for one in sorted(changes, key=self.measure):
-            best.setdefault(self.trials[one.added[0]].effect.id, one)
-        return [one for one in best.values() if math.isfinite(self.measure(one))]
+        first = self._pick(sorted(changes, key=self.measure))
+        return [one for one in first if math.isfinite(self.measure(one))]
 
     def choose(self, given: Collection[str], banned: Collection[tuple[str, ...]]) -> list[Change]:
         """Sets that promise less cost, the best first: those on the way of steepest moves, and others near.
@@ -333,10 +337,8 @@ class Matrix:
             steps.append(now)
         paying = sorted((one for one in seen if self.measure(one) < start - _FALL), key=self.measure)
         single = [one for one in paying if len(one.gone) <= 1 and len(one.added) <= 1]
-        chosen: dict[tuple[str, ...], Change] = {}
-        for one in (*steps, *self._pick(single)[:_BESIDE], *paying):
-            chosen.setdefault(self.name(one), one)
-        return [one for name, one in chosen.items() if name not in banned]
+        chosen = self._pick((*steps, *self._pick(single)[:_BESIDE], *paying))
+        return [one for one in chosen if self.name(one) not in banned]
 
     def _pick(self, changes: Iterable[Change]) -> list[Change]:
         """The first of each set."""
@@ -378,10 +380,6 @@ class Matrix:
         aim[columns] -= self._solve(change)[1]
         block = self.fit.path.block[self.fit.white.rows]
         return np.asarray(np.bincount(block, (self._white @ aim) ** 2), dtype=np.float64)
-
-    def find_price(self, change: Change) -> float:
-        """What the numbers of a set must bring."""
-        return self._price(change)
 
 
 def _width(columns: Floats) -> int:

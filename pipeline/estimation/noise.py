@@ -165,10 +165,6 @@ class Noise:
         return 2.0 * float((np.broadcast_to(weights, spreads.shape)[known] * np.log(spreads[known])).sum())
 
 
-NO_NOISE = Noise(1.0, np.zeros(3), np.zeros(3), np.full((1, 3), np.inf))
-"""Of channels that say nothing: before any was learned."""
-
-
 def learn_noise(
     residual: Floats,
     steps: Steps,

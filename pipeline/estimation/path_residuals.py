@@ -82,7 +82,7 @@ class PathResiduals(ABC):
         prior: of the parameters.
         weight: of each step in a fit, shape (n, 1); one number where all runs count alike.
         dates_poses: whether its fixed clocks are those of the poses.
-        reads_late: whether its delays are those of encoders against the commands.
+        is_delayed: whether its delays are those of its input; else of the encoders against the commands.
         clocks: ids of effects that are a clock of each single run.
         grounds: numbers of the runs on each ground; one empty group where all are on one.
         title: name of the path.
@@ -92,7 +92,6 @@ class PathResiduals(ABC):
     weight: Floats | float = 1.0
     dates_poses: bool = True
     is_delayed: bool = True
-    reads_late: bool = False
     channels: tuple[int, ...] = (0, 1, 2)
     title: str
 
@@ -352,7 +351,6 @@ class WheelResiduals(PathResiduals):
     title = "Drivetrain effects"
     dates_poses = False
     is_delayed = False
-    reads_late = True
 
     def __init__(
         self,
@@ -365,7 +363,6 @@ class WheelResiduals(PathResiduals):
         super().__init__([one.stepped.where_read for one in commanded], ("encoder_delay_s",))
         self._exceeded = exceeded
         self.channels = (0, 1, 2) if sideways else (0, 2)
-        self.measured = tuple(measured)
         self._spans = [locate_windows(run_residuals) for run_residuals in self.residuals_by_run]
         self._seen = [
             average_windows(one, wheels.predict_velocity((), _NO_DELAY), spans)
@@ -382,7 +379,7 @@ class WheelResiduals(PathResiduals):
         A delay of the commands is that of the encoders, too: both are one number.
         """
         free = super().list_free(state, per_run)
-        return tuple(self._bound(state, one) for one in free if one.effect or not _is_delayed(state))
+        return tuple(self._bound(state, one) for one in free if one.effect or not _has_dead_time(state))
 
     def _bound(self, state: ModelState, number: Free) -> Free:
         if not number.effect:
@@ -399,37 +396,35 @@ class WheelResiduals(PathResiduals):
 
         The model is delayed, not the measured wheels: the same readings are compared at every delay.
         """
+        return self._compare(state, run)
+
+    def _compare(self, state: ModelState, run: int, late_s: float = 0.0) -> Floats:
+        """Velocities with the encoders later by ``late_s`` [s]."""
         run_residuals = self.residuals_by_run[run]
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        late = 0.0 if _is_delayed(state) else state.timing[run].encoder_delay_s
-        spans = self._spans[run] if late == 0.0 else locate_windows(run_residuals, late)
+        late_s += 0.0 if _has_dead_time(state) else state.timing[run].encoder_delay_s
+        spans = self._spans[run] if late_s == 0.0 else locate_windows(run_residuals, late_s)
         driven = average_windows(run_residuals, run_residuals.predict_wheels(drive, _NO_DELAY), spans)
         apart: Floats = self._seen[run] - driven
         return apart
 
     def list_clock_errors(self, state: ModelState) -> Floats:
         """See `PathResiduals`: when within a cell, or a period, an encoder was read is not known."""
-        if _is_delayed(state):
+        if _has_dead_time(state):
             return np.array([one.run.wheel_period_s for one in self.residuals_by_run]) / _UNIFORM
         return np.array([_WITHIN_CELL * one.grid.step_s for one in self.residuals_by_run])
 
     def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
         """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
-        run_residuals = self.residuals_by_run[run]
-        drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        late = late_s if _is_delayed(state) else late_s + state.timing[run].encoder_delay_s
-        driven = run_residuals.predict_wheels(drive, _NO_DELAY)
-        moved = average_windows(run_residuals, driven, locate_windows(run_residuals, late))
-        return self._multiply(self._seen[run] - moved, run)
+        return self._multiply(self._compare(state, run, late_s), run)
 
     def list_rolled(self, state: ModelState) -> tuple[Floats, float]:  # noqa: ARG002 - wheels are as they are
         """See `PathResiduals`: the measured wheels, which body commands are compared with."""
-        seen = [one.predict_velocity((), _NO_DELAY) for one in self.measured]
         is_body = all(one.run.alignment.body_multiplier is not None for one in self.residuals_by_run)
-        return self._average(seen), 1.0 if is_body else 0.0
+        return np.concatenate(self._seen) * self.spans[:, None], 1.0 if is_body else 0.0
 
 
-def _is_delayed(state: ModelState) -> bool:
+def _has_dead_time(state: ModelState) -> bool:
     return find_late(state.effects, Late.COMMANDS) is not None
 
 
