@@ -204,14 +204,14 @@ class Search:
         first = fit_path(self.path, start)
         final, judged = self.name_all(self.search_possible(first))
         matrix = self.make_matrix(final)
-        rivals = list[Rival]()
+        rivals = list(self._list_rivals(final, matrix, judged))
         for _ in range(_BETTER):
-            rivals = list(self._list_rivals(final, matrix, judged))
             better = min(rivals, key=lambda one: one.behind, default=None)
             if better is None or better.behind > -EQUAL or self.budget.is_spent():
                 break
             final, judged = self.name_all(self.search_possible(better.fit))
             matrix = self.make_matrix(final)
+            rivals = list(self._list_rivals(final, matrix, judged))
         named = tuple(name for name, one in judged.items() if not one.refusal)
         return SearchResult(first, final, named, judged, tuple(rivals), matrix)
 
