@@ -298,19 +298,13 @@ class Matrix:
         return made
 
     @cached_property
-    def _leading(self) -> list[int]:
+    def _leading(self) -> list[Change]:
         """The best start of each candidate, the best candidate first; impossible ones last."""
-        best: dict[str, int] = {}
-        for _, index in sorted(
-            (self.measure(Change().add(index)), index) for index in range(len(self.trials))
-        ):
-            best.setdefault(self.trials[index].effect.id, index)
-        return list(best.values())
+        return self._pick(sorted(map(self.add, range(len(self.trials))), key=self.measure))
 
     def list_singles(self) -> list[Change]:
         """The best start of each candidate that is possible, the best candidate first."""
-        singles = (self.add(index) for index in self._leading)
-        return [one for one in singles if math.isfinite(self.measure(one))]
+        return [one for one in self._leading if math.isfinite(self.measure(one))]
 
     def list_replacements(self, name: str) -> list[Change]:
         """The best start of each candidate in the place of an effect, the best candidate first."""
@@ -365,8 +359,11 @@ class Matrix:
             yield from (self.add(index, to=now.drop(name)) for index in new)
         for two in combinations(stay, 2):
             yield from (self.add(index, to=now.drop(*two)) for index in new)
-        for pair in combinations(self._leading[:_PAIRED], 2):
-            if not have & {ids[index] for index in pair}:
+        leading = [index for one in self._leading[:_PAIRED] for index in one.added]
+        for pair in combinations(leading, 2):
+            if not have & {ids[index] for index in pair} and all(
+                self.trials[i].replaces <= free for i in pair
+            ):
                 yield self.add(*pair, to=now)
         for index in new:
             effect = self.trials[index].effect
