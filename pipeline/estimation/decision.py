@@ -452,6 +452,35 @@ class Search:
             self._excluded.add(least)
             fit = self.search_possible(fit_path(self.path, fit.state.drop([least]), noise=fit.noise))
 
+    def choose_proven(self, base: PathFit) -> tuple[PathFit, dict[str, Judged]]:
+        """The best set near a model of effects that are all proven, and how each was judged.
+
+        It is chosen on the one matrix of that model, and what is not proven is chosen no more: for candidates
+        whose influence is linear, such as the terms of a formula.
+
+        Args:
+            base: the model; it is what is returned where no set is better.
+        """
+        matrix, excluded = self.make_matrix(base), set[str]()
+        while True:
+            best = min(matrix.choose(self.given, (), excluded), key=matrix.measure, default=None)
+            if best is None:
+                return base, {}
+            without = {matrix.trials[index].effect.id: best.without(index) for index in best.added}
+            stay = [name for name in base.ids if name not in best.gone and name not in self.given]
+            without |= {name: best.drop(name) for name in stay}
+            paid = {name: _find_frequency(matrix, best, one) for name, one in without.items()}
+            least = min(paid, key=lambda name: (paid[name], name), default="")
+            if paid.get(least, 1.0) < _SURE:
+                excluded.add(least)
+                continue
+            fit = fit_path(self.path, self._look(matrix, best)[2], noise=matrix.noise)
+            judged = self.judge_all(fit)
+            refused = [one for one in judged.values() if not one.is_proven]
+            if not refused:
+                return fit, judged
+            excluded.add(min(refused, key=lambda one: (one.frequency, one.t, one.effect)).effect)
+
     def judge_all(self, fit: PathFit) -> dict[str, Judged]:
         """How each effect of a model is judged, but for given ones and those too small for a name."""
         asked = [
@@ -572,10 +601,7 @@ def judge(
         least_t: standard errors that it must be from none.
     """
     path, base = fit.path, _drop_linearly(fit, effect.id, matrix.without[effect.id])
-    gone = Change().drop(effect.id)
-    brings = matrix.sum_blocks(gone) - matrix.sum_blocks(Change())
-    price = matrix.find_price(Change()) - matrix.find_price(gone)
-    frequency = float(np.mean(_resample(brings.size) @ brings > price))
+    frequency = _find_frequency(matrix, Change(), Change().drop(effect.id))
     costs = [list_costs(path, fit.noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
     own = list_costs(path, fit.noise, base.residual) - list_costs(path, fit.noise, fit.residual)
@@ -600,6 +626,13 @@ def judge(
         elif not _is_material(path, change):
             refusal = "nobody would notice it"
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
+
+
+def _find_frequency(matrix: Matrix, change: Change, without: Change) -> float:
+    """Share of resampled recordings in which what a set has beyond another pays for its numbers."""
+    brings = matrix.sum_blocks(without) - matrix.sum_blocks(change)
+    price = matrix.find_price(change) - matrix.find_price(without)
+    return float(np.mean(_resample(brings.size) @ brings > price))
 
 
 def _drop_linearly(fit: PathFit, name: str, residual: Floats) -> PathFit:

@@ -312,17 +312,23 @@ class Matrix:
         first = self._pick(sorted(changes, key=self.measure))
         return [one for one in first if math.isfinite(self.measure(one))]
 
-    def choose(self, given: Collection[str], banned: Collection[tuple[str, ...]]) -> list[Change]:
+    def choose(
+        self,
+        given: Collection[str],
+        banned: Collection[tuple[str, ...]] = (),
+        excluded: Collection[str] = (),
+    ) -> list[Change]:
         """Sets that promise less cost, the best first: those on the way of steepest moves, and others near.
 
         Args:
             given: ids of effects that stay.
             banned: names of sets that are not chosen.
+            excluded: ids of effects that are in none.
         """
-        start, now = self.measure(Change()), Change()
+        start, now = self.measure(Change()), Change().drop(*{*self.fit.ids}.intersection(excluded))
         steps, seen = list[Change](), {now}
         while True:
-            moves = dict.fromkeys(self._list_moves(now, given))
+            moves = dict.fromkeys(self._list_moves(now, given, excluded))
             seen.update(moves)
             best = min(moves, key=self.measure, default=now)
             if not self.measure(best) < self.measure(now) - _FALL:
@@ -341,18 +347,19 @@ class Matrix:
             first.setdefault(self.name(one), one)
         return list(first.values())
 
-    def _list_moves(self, now: Change, given: Collection[str]) -> Iterator[Change]:
+    def _list_moves(self, now: Change, given: Collection[str], excluded: Collection[str]) -> Iterator[Change]:
         """What one move makes of a set: drop, add, exchange, one for two, two, a whole for its parts."""
         ids = [trial.effect.id for trial in self.trials]
         stay = [name for name in self.fit.ids if name not in now.gone and name not in given]
         have, free = {ids[index] for index in now.added}, {*self.fit.ids}.difference(given)
-        new = [i for i, one in enumerate(self.trials) if ids[i] not in have and one.replaces <= free]
+        known = have.union(excluded)
+        new = [i for i, one in enumerate(self.trials) if ids[i] not in known and one.replaces <= free]
         for index in now.added:
             rest = now.without(index)
             yield rest
             yield from (self.add(other, to=rest) for other in range(len(ids)) if ids[other] == ids[index])
             yield from (self.add(other, to=rest) for other in new)
-        yield from (Change(now.gone - {name}, now.added) for name in now.gone)
+        yield from (Change(now.gone - {name}, now.added) for name in now.gone.difference(excluded))
         yield from (self.add(index, to=now) for index in new)
         for name in stay:
             yield now.drop(name)
@@ -361,7 +368,7 @@ class Matrix:
             yield from (self.add(index, to=now.drop(*two)) for index in new)
         leading = [index for one in self._leading[:_PAIRED] for index in one.added]
         for pair in combinations(leading, 2):
-            if not have & {ids[index] for index in pair} and all(
+            if not known & {ids[index] for index in pair} and all(
                 self.trials[i].replaces <= free for i in pair
             ):
                 yield self.add(*pair, to=now)

@@ -53,14 +53,7 @@ def search_formula(
     wheels = not others and first.context.vehicle.kind == "differential"
     final, terms = outcome.final, list_terms(sideways=sideways, wheels=wheels)
     wide = replace(search, candidates=terms, least_t=math.sqrt(LEAST_T**2 + 2.0 * math.log(SHAPES)))
-    beside = wide.search_possible(final)
-    if not _list_terms(beside):
-        return outcome, None
-    fit, judged = wide.name_all(beside)
-    if _list_terms(fit) and len(fit.ids) > len(_list_terms(fit)) + len(search.given):
-        # What an effect and a term say together, another term may say alone.
-        other = wide.name_all(wide.search_possible(outcome.start))
-        fit, judged = min((other, (fit, judged)), key=lambda one: find_cost(one[0]))
+    fit, judged = wide.choose_proven(final)
     gone = set(final.ids) - set(fit.ids)
     named = [one for one in _list_terms(fit) if one.id in judged and not judged[one.id].refusal]
     fall = find_cost(final) - find_cost(fit)
