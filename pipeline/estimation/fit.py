@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _ENOUGH = 0.05
 """Fall of chi-square below which a step is not worth taking."""
-_SETTLED = 1e-8
-"""The same for a model that is written: it ends at the same values from every start."""
+_SETTLED = 1e-5
+"""The same for a model that is written: its numbers are within some thousandths of a standard error then."""
 _ASTRAY = 100.0
 """Expected fall over the least so far, above which steps lead nowhere."""
 _NEWS = 1.0
@@ -227,7 +227,6 @@ def fit_path(
     *,
     noise: Noise | None = None,
     per_run: Sequence[str] = (),
-    exact: bool = False,
 ) -> PathFit:
     """Fit all numbers of a state to one path, with the noise of its residuals.
 
@@ -238,28 +237,30 @@ def fit_path(
         start: state to start from.
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
-        exact: whether numbers must converge, not only the likelihood.
     """
     free, residual = path.list_free(start, per_run), path.find_residuals(start)
-    learned = path.learn(residual, noise, exact=exact)
     columns = path.differentiate(start, residual, free)
-    fit = _fit_to_the_end(PathFit(path, start, free, residual, columns, learned))
-    return _settle(fit) if exact and fit.smooth else fit
+    return _fit_to_the_end(PathFit(path, start, free, residual, columns, path.learn(residual, noise)))
 
 
-def _settle(fit: PathFit) -> PathFit:
+def settle(fit: PathFit) -> PathFit:
     """The place where no derivative pulls any more, by Newton's steps: a fit ends there from every start.
 
-    The cost has many dents where limits and friction begin to act; what wide derivatives see has none.
+    The cost has many dents where limits and friction begin to act; what wide derivatives see has few. Whole
+    steps would lead from dent to dent: they become shorter with each one that leads no nearer (stochastic
+    approximation with Kesten's rule: Annals of Mathematical Statistics 29, 1958).
     """
-    path, best, least = fit.path, fit, math.inf
+    path, least = fit.path, math.inf
+    best = fit = replace(fit, noise=path.learn(fit.residual, fit.noise, exact=True))
+    further, before = 0, math.inf
     for _ in range(_MOST_STEPS):
         moving, step, expected = _solve(fit, _LOOSEST)
         if expected < least:
             best, least = fit, expected
         if expected < _SETTLED or expected > _ASTRAY * least:
             break
-        state = fit.state.move(moving, step)
+        further, before = further + (expected > before), expected
+        state = fit.state.move(moving, [one / (1 + further) for one in step])
         residual = path.find_residuals(state)
         noise = path.learn(residual, fit.noise, exact=True)
         moved = replace(fit, state=state, residual=residual, noise=noise)

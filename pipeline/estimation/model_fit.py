@@ -7,8 +7,9 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 from pipeline.estimation.candidates import Unset
-from pipeline.estimation.fit import PathFit, fit_path
+from pipeline.estimation.fit import PathFit, fit_path, settle
 from pipeline.estimation.matrix import Matrix
+from pipeline.estimation.model_state import ModelState
 from pipeline.models import Model
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from pipeline.core import Floats
     from pipeline.estimation.estimation_data import EstimationData
-    from pipeline.estimation.model_state import Free, ModelState
+    from pipeline.estimation.model_state import Free
     from pipeline.estimation.path_residuals import PathResiduals
 
 
@@ -76,8 +77,8 @@ def fit_model(
         model: effects at neutral values are searched from several starts; others start at their values.
         per_run: labels ``effect.name`` or ids with one value per run.
         start: a fit of nearly the same model, from whose values those of common effects start.
-        exact: iterate until the parameters converge, so that the same model has the same estimates from
-            every start; otherwise until the likelihood converges, which is enough to compare models.
+        exact: settle the parameters, so that the same model has the same estimates from every start;
+            otherwise only the likelihood converges, which is enough to compare models.
 
     Returns:
         The fit; for a parameter at its bound, the data would fit better beyond it.
@@ -89,11 +90,17 @@ def fit_model(
     fits: list[PathFit] = []
     for path in data.paths:
         mine = state.hold([common.get(effect.id, effect) for effect in effects if path.owns(effect)])
-        begin = (path, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
+        delay = "wheel_delay_s" if path.is_delayed else "encoder_delay_s"
+        delays = tuple(getattr(one, delay) for one in mine.timing)
+        begin = (path, mine.effects, delays, repr(mine.own), tuple(per_run), exact)
         fit = data.fits.recall(begin, partial(_fit_from, data, path, mine, per_run, exact=exact))
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
-        state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
+        timing = tuple(
+            replace(one, **{delay: getattr(fitted, delay)})
+            for one, fitted in zip(state.timing, fit.state.timing, strict=True)
+        )
+        state = ModelState(state.effects, timing, {**state.own, **own}).add(*fit.state.effects)
     acting = {effect.id for effect in effects}
     return Fitted(data, state.hold([one for one in state.effects if one.id in acting]), tuple(fits))
 
@@ -119,7 +126,7 @@ def _fit_from(
             # Values that the start does not change may be fitted here.
             extended = extended if started is None else extended.add(effect.change(**started.values))
         fit = fit_path(path, extended, noise=fit.noise, per_run=per_run)
-    return _write_down(fit_path(path, fit.state, per_run=per_run, exact=True)) if exact else fit
+    return _write_down(settle(fit)) if exact else fit
 
 
 def _write_down(fit: PathFit) -> PathFit:
