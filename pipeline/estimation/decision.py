@@ -441,9 +441,12 @@ class Search:
     def name_all(self, fit: PathFit) -> tuple[PathFit, dict[str, Judged]]:
         """The model without effects that are not proven beside its others, and how each was judged.
 
-        What goes may have kept out what is there: the search goes on without it.
+        What goes may have kept out what is there: the search goes on without it. Of a drive that does not do
+        what it is told, nothing is named.
         """
         while True:
+            if not self.path.is_followed(fit.residual):
+                return fit_path(self.path, fit.state.drop({*fit.ids} - self.given), noise=fit.noise), {}
             judged = self.judge_all(fit)
             refused = [one for one in judged.values() if not one.is_proven]
             if not refused:

@@ -43,6 +43,9 @@ _WITHIN_CELL = 0.05
 """Standard error of a time constant in cells: drawn lags are found within a tenth of a cell."""
 _MOST_PERIODS = 2.0
 """Largest delay of encoders against the commands, in their periods."""
+_MOST_LEFT = 0.5
+"""Share of the mean square motion of wheels that a model of the drivetrain may leave: in drawn logs, drives
+that follow leave less than a hundredth, those that do not more than six tenths."""
 _NO_DELAY = Timing()
 _UNIFORM = 12.0**0.5
 """Ratio of width and standard deviation of a uniform distribution."""
@@ -151,6 +154,10 @@ class PathResiduals(ABC):
         """Measured less predicted increments of some runs, in order, by default of all, shape (n, 3)."""
         residuals = [self.find_run_residuals(state, run) for run in runs or range(len(self.residuals_by_run))]
         return residuals[0] if len(residuals) == 1 else np.concatenate(residuals)
+
+    def is_followed(self, residual: Floats) -> bool:  # noqa: ARG002 - the body follows its wheels, or slips
+        """Whether what residuals leave of the motion, shape (n, 3), allows to speak of a model of it."""
+        return True
 
     @abstractmethod
     def list_clock_errors(self, state: ModelState) -> Floats:
@@ -390,6 +397,12 @@ class WheelResiduals(PathResiduals):
         low, high = number.bounds
         least = max(low, self._exceeded.get(of, low) / OVERSHOOT)
         return replace(number, bounds=(least, high)) if least < high else number
+
+    def is_followed(self, residual: Floats) -> bool:
+        """See `PathResiduals`: the wheels follow where half of one channel's motion is explained."""
+        left = np.square(residual).sum(axis=0)
+        seen = np.square(np.concatenate(self._seen) * self.spans[:, None]).sum(axis=0)
+        return any(left[channel] <= _MOST_LEFT * seen[channel] for channel in self.channels)
 
     def find_velocities(self, state: ModelState, run: int) -> Floats:
         """See `PathResiduals`; in terms of the ideal velocity of the wheels.
