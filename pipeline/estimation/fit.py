@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _ENOUGH = 0.05
 """Fall of chi-square below which a step is not worth taking."""
-_SETTLED = 1e-5
-"""The same for a model that is written: its numbers are within some thousandths of a standard error then."""
+_SETTLED = 1e-8
+"""The same for a model that is written: six digits of its numbers are the same from every start."""
 _ASTRAY = 100.0
 """Expected fall over the least so far, above which steps lead nowhere."""
 _NEWS = 1.0
