@@ -122,6 +122,17 @@ def test_a_lag_that_sampling_makes_is_the_delay_of_the_encoders() -> None:
     assert "acceleration_limit" not in found.final.ids
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_of_wheels_that_do_something_else_than_they_are_told_nothing_is_named(seed: int) -> None:
+    """By chance a gain or a limit made of another command what comes nearest."""
+    encoders = Encoders(rate_hz=20.0, noise_radps=0.003)
+    told, done = (drive({}, seed=one, encoders=encoders) for one in (seed, seed + 10))
+    data = prepare_data([replace(done, commands=told.commands)], HUSKY, Input.COMMAND)
+    found = Search(data.paths[1], data.list_drivetrain(), data.conditions).run(data.start_state())
+    assert found.new == ()
+    assert found.final.ids == ()
+
+
 def test_a_delay_too_small_for_a_name_keeps_none_from_what_comes_with_it() -> None:
     """Contact friction, which follows late, was as good as the track alone."""
     encoders = Encoders(rate_hz=20.0, noise_radps=0.003)
