@@ -54,6 +54,10 @@ def search_formula(
     final, terms = outcome.final, list_terms(sideways=sideways, wheels=wheels)
     wide = replace(search, candidates=terms, least_t=math.sqrt(LEAST_T**2 + 2.0 * math.log(SHAPES)))
     fit, judged = wide.choose_proven(final)
+    if _list_terms(fit) and len(fit.ids) > len(_list_terms(fit)) + len(search.given):
+        # What an effect and a term say together, another term may say alone.
+        chosen = [(fit, judged), wide.choose_proven(outcome.start)]
+        fit, judged = min(chosen, key=lambda one: find_cost(one[0]))
     gone = set(final.ids) - set(fit.ids)
     named = [one for one in _list_terms(fit) if one.id in judged and not judged[one.id].refusal]
     fall = find_cost(final) - find_cost(fit)

@@ -227,7 +227,12 @@ class Effect(ABC):
     def _make_sentences(self, vehicle: Vehicle, beside: Iterable[Effect]) -> Sentences:
         others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}
         title = self.id.replace("_", " ").capitalize()
-        return Sentences(title, find_words(self.id), self.values, vehicle, self.open_numbers, others)
+        values = {**self.values, **self.list_seen(vehicle)}
+        return Sentences(title, find_words(self.id), values, vehicle, self.open_numbers, others)
+
+    def list_seen(self, vehicle: Vehicle) -> Mapping[str, float]:
+        """Numbers that its sentences have beside its own: what a person sees of it, by name."""
+        return {}
 
     def can_show(self, conditions: Conditions) -> bool:
         """Whether the sensors and the driving can identify it at all."""

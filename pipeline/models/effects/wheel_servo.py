@@ -42,6 +42,7 @@ from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
 from pipeline.run import RunContext, Wheels
+from pipeline.sources import Vehicle
 
 _LEAST_TAU_S = 0.01
 """Smallest time constant [s]: a quarter of a cell at 25 Hz, within which the wheels follow at once."""
@@ -57,6 +58,10 @@ _OTHER_RIM = 1.5
 """Ratio of speeds of rims from which starts are scaled: a bound that never acts has no derivative."""
 _ALIKE_AT, _SLOPES = 3.0, (0.5, 0.7, 1.4, 2.0)
 """Speed [m/s] at which other motors have the same force, and how fast theirs falls, by that of this one."""
+_STEP_MPS, _STEP_CELL_S, _WATCHED_S = 1.0, 0.01, 5.0
+"""Step of the command by which it is described [m/s], width of a cell, and how long it is watched [s]."""
+_RISEN, _NEARLY_ALL = 1.0 - math.exp(-1.0), 0.98
+"""Share of a step after one time constant, and share that counts as all of it."""
 _TINY = 1e-6
 """Friction [m/s] that counts as none: a divisor."""
 _NO_COMMAND = 1e-6
@@ -237,7 +242,7 @@ class WheelServo(JointDrive):
         states[:, :2, known] = np.where(np.isfinite(start), start, states[:, :2, known])
         states[:, 2, known] = np.isfinite(start).all(axis=0)
         states[:, 2, np.searchsorted(at, context.spans.first)] = 0.0
-        numbers = [effect.list_numbers(context, wheels.imbalance) for effect, wheels in pairs]
+        numbers = [effect.list_numbers(context.track_m, wheels.imbalance) for effect, wheels in pairs]
         source = [index_of[id(wheels)] for _, wheels in pairs]
         rolled = walk_each(numbers, source, asked, at, states, context.step_s)
         rolled /= radius
@@ -246,7 +251,31 @@ class WheelServo(JointDrive):
             for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
         ]
 
-    def list_numbers(self, context: RunContext, imbalance: float) -> Floats:
+    def list_seen(self, vehicle: Vehicle) -> dict[str, float]:
+        """What it makes of a step of the command from rest, straight ahead and on the spot.
+
+        Returns:
+            ``asked``, the speed of the step [m/s]; ``rise``, time to 63 % of it straight ahead [s], NaN where
+            it is not reached; ``turned``, the share of it that both sides keep on the spot, NaN where it is
+            nearly all.
+        """
+        step = min(_STEP_MPS, vehicle.max_speed_mps or math.inf)
+        seen = {"asked": step, "rise": math.nan, "turned": math.nan}
+        if self.is_neutral or any(map(math.isnan, self.values.values())):
+            return seen
+        asked = np.zeros((2, 3, round(_WATCHED_S / _STEP_CELL_S)))
+        asked[:, :2] = step
+        asked[1, 0] *= -1.0
+        numbers = self.list_numbers(vehicle.track_width_m or 1.0, 0.0)
+        start = np.zeros(1, dtype=np.int64), np.zeros((2, 3, 1))
+        ahead, around = walk_each([numbers, numbers], [0, 1], asked, *start, _STEP_CELL_S)
+        share = ahead.mean(axis=0) / step
+        if share.max() >= _RISEN:
+            seen["rise"] = float(np.argmax(share >= _RISEN) + 1) * _STEP_CELL_S
+        kept = float(around[1, -1] - around[0, -1]) / (2.0 * step)
+        return seen | ({"turned": kept} if kept < _NEARLY_ALL else {})
+
+    def list_numbers(self, track_m: float, imbalance: float) -> Floats:
         """The numbers of `walk_each`."""
         tau, scrub = max(self.values["tau"], _LEAST_TAU_S), self.values["scrub"]
         gain = 0.5 * (1.0 + ROTATING) / tau
@@ -260,7 +289,7 @@ class WheelServo(JointDrive):
                 (self.values["creep"] * tau) ** 2,
                 (_REST * tau) ** 2 if scrub > 0.0 else math.inf,
                 (tau / max(scrub, _TINY)) ** 2,
-                0.5 * context.track_m,
+                0.5 * track_m,
                 self._slope * gain,
             )
         )
