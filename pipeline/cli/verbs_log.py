@@ -43,6 +43,7 @@ from pipeline.core import (
     name_first,
     shorten,
 )
+from pipeline.words import format_finding
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import Outcome
@@ -225,7 +226,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
             lines += _format_ratings(seen.choice.ratings)
             lines += _format_evidence(seen.choice.recording)
         findings = sorted(seen.choice.findings, key=lambda one: one.severity == "info")
-        notes += [f"note      {finding.text}" for finding in findings]
+        notes += [f"note      {format_finding(finding)}" for finding in findings]
     lines += _cut(notes, everything=everything)
     if seen.problem:
         why = f"{seen.problem.what}. {seen.problem.hint.rstrip('.')}."

@@ -241,18 +241,20 @@ class Case:
             given = ["axes"]
         if given and section == "pose":
             text = f"{what}, but [pose] in run.toml gives {', '.join(given)}, which is taken as it is given"
-            self.findings.append(Finding("pose_contradicted", "warning", text, where=section, value=margin))
+            self.findings.append(
+                Finding("pose_contradicted", "warning", section, {"value": margin}, text=text)
+            )
             return
         if given:
             text = f"{what}, but [{section}] in run.toml gives {', '.join(given)}: correct it"
-            self.findings.append(Finding("signs_contradict", "error", text, where=section))
+            self.findings.append(Finding("signs_contradict", "error", section, text=text))
             return
         self.changes.setdefault(section, {}).update(change)
         as_recorded = {**_AS_RECORDED[section]} | ({"unit": f'unit = "{usual}"'} if usual else {})
         settled = [text for key, text in as_recorded.items() if key in change]
         otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
         text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
-        self.findings.append(Finding(name, "warning", text, where=section, value=margin))
+        self.findings.append(Finding(name, "warning", section, {"value": margin}, text=text))
 
     def complete(self) -> Configuration:
         """The user's configuration with the corrections."""

@@ -72,7 +72,7 @@ def measure_command_scale(
         f"in turns the difference of the wheels is {turning / forward:.2f} times the one commanded "
         f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
     )
-    finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
+    finding = Finding("controller_multiplier", "warning", "command", {"value": multiplier}, text=text)
     return replace(neutral, track_multiplier=multiplier), (finding,)
 
 
@@ -84,7 +84,7 @@ def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
         f"commanded: their readings are {forward:.2f} times too large (scale = {1.0 / forward:.3g} under "
         f"[wheels] in run.toml), or their radius is {radius / forward:.3g} m and not {radius:.3g} m"
     )
-    return Finding("wheels_scaled", "warning", text, where="wheels", value=forward)
+    return Finding("wheels_scaled", "warning", "wheels", {"value": forward}, text=text)
 
 
 def _explain_scale(
@@ -108,7 +108,7 @@ def _explain_scale(
         cause = f"that of another vehicle ({other.name}: {sizes})"
         done = f"corrected (mean of the sides times {scales[0]:.2f}, their difference times {scales[1]:.2f})"
     text = f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
-    finding = Finding("command_scale", "warning", text, where="command", value=scales[0])
+    finding = Finding("command_scale", "warning", "command", {"value": scales[0]}, text=text)
     return replace(neutral, command_scale=scales[0], command_turn_scale=scales[1]), (finding,)
 
 
@@ -223,7 +223,7 @@ def _take_as_followed(case: Case, command: Candidate, alignment: Alignment) -> A
         f"{ahead:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them"
     )
-    case.findings.append(Finding("command_scale", "warning", text, where="command", value=ahead))
+    case.findings.append(Finding("command_scale", "warning", "command", {"value": ahead}, text=text))
     return replace(alignment, command_scale=ahead, command_turn_scale=turn)
 
 

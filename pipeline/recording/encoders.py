@@ -260,7 +260,7 @@ def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels:
             "its motor is wrong; exchange its wires, or turn its sign in the driver"
         )
         case.findings.append(
-            Finding("motor_reversed", "error", text, where="command", value=explained.sign_margin)
+            Finding("motor_reversed", "error", "command", {"value": explained.sign_margin}, text=text)
         )
         return True
     return False
@@ -281,5 +281,5 @@ def report_dead(case: Case, wheels: Candidate, without: str = "") -> bool:
     rest = without or f"take --input command, or correct [wheels] {dead}"
     text = f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: "
     text += f"it is dead ({rest})"
-    case.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
+    case.findings.append(Finding("wheel_dead", "error", f"wheels {dead}", text=text))
     return True

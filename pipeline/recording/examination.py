@@ -241,7 +241,7 @@ def _report_ground(wheels: DriveSource) -> Finding:
         "ground does is not observable, and slip in these results is the difference between "
         "commanded and measured wheels"
     )
-    return Finding(GROUND_UNOBSERVABLE, "warning", text, where="pose")
+    return Finding(GROUND_UNOBSERVABLE, "warning", "pose", text=text)
 
 
 def _stand_in(case: Case) -> Recording | None:
@@ -343,7 +343,9 @@ def _report_opposite(case: Case, command: Candidate, wheels: Candidate) -> None:
         f"{what}, and no third signal shows which of them is wrong: either the encoders ({mend}), or the "
         "command or the polarity of the motors, which are to be corrected on the robot"
     )
-    case.findings.append(Finding("signs_contradict", "error", text, where="command, wheels", value=margin))
+    case.findings.append(
+        Finding("signs_contradict", "error", "command, wheels", {"value": margin}, text=text)
+    )
 
 
 def _find_unit(case: Case, wheels: Candidate, command: Candidate) -> None:

@@ -58,7 +58,7 @@ def find_in_folder(index: LogIndex) -> tuple[Recognized | None, tuple[Finding, .
     if len(named) > 1:
         names = enumerate_texts([vehicle.name for vehicle, _ in named.values()])
         text = f"{lost}; recordings of its folder with the same topics name several ({names}): none is taken"
-        return None, (Finding("vehicle_of_folder", "warning", text, where="vehicle"),)
+        return None, (Finding("vehicle_of_folder", "warning", "vehicle", text=text),)
     ((vehicle, logs),) = named.values()
     who = logs[0] if len(logs) == 1 else f"{logs[0]} and {len(logs) - 1} more"
     are = "is" if len(logs) == 1 else "are"
@@ -66,7 +66,7 @@ def find_in_folder(index: LogIndex) -> tuple[Recognized | None, tuple[Finding, .
         f"{lost}: it is taken to be a {vehicle.name}, as {who} of its folder with the same topics {are}; "
         f'another: --vehicle, or in run.toml: [vehicle] preset = "{vehicle.id}"'
     )
-    return Recognized(vehicle, "folder"), (Finding("vehicle_of_folder", "warning", text, where="vehicle"),)
+    return Recognized(vehicle, "folder"), (Finding("vehicle_of_folder", "warning", "vehicle", text=text),)
 
 
 def _list_beside(path: Path) -> list[Path]:

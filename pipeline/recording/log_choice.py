@@ -259,7 +259,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
             if error.code != "field_not_found" or topic is None or is_wanted:
                 raise
             text = f"{topic} is left out: {error.what}"
-            findings.append(Finding("topic_left_out", "warning", text, where=topic))
+            findings.append(Finding("topic_left_out", "warning", topic, text=text))
             index = replace(index, channels=tuple(one for one in index.channels if one.topic != topic))
         else:
             return replace(chosen, findings=(*findings, *chosen.findings))
@@ -295,7 +295,7 @@ def _choose_readable(
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
     findings += beside
     findings += [
-        Finding("vehicle_choice", "info", note, where="vehicle")
+        Finding("vehicle_choice", "info", "vehicle", text=note)
         for note in (recognized.notes if recognized else ())
     ]
     recorded = find_preset(index.deployment.get("vehicle") or "")
@@ -303,7 +303,7 @@ def _choose_readable(
     findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
     if sources.command is None and sources.wheels is not None and sources.pose is not None:
         text = "the log contains no commands: it is analyzed from wheel encoders"
-        findings.append(Finding("no_command", "info", text, where="command"))
+        findings.append(Finding("no_command", "info", "command", text=text))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     chosen = _choose_pose(chosen, channels, index, configuration)
     # The content may leave no drive: what was chosen by name is a drive all the same.
@@ -387,7 +387,7 @@ def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[lis
     fullest = set(sorted(rivals, key=lambda rival: -messages[rival.topic])[: MOST_POSES - 1])
     count = len(rivals) + 1
     text = f"{count} topics or frames hold poses: the {MOST_POSES} with most messages were compared"
-    finding = Finding("poses_left_out", "warning", text, where="pose", count=count - MOST_POSES)
+    finding = Finding("poses_left_out", "warning", "pose", {"count": count - MOST_POSES}, text=text)
     return [rival for rival in rivals if rival in fullest], finding
 
 
@@ -479,7 +479,7 @@ def _leave_out_silent(
     unread = set(silent)
     channels = [channel for channel in channels if channel.topic not in unread]
     sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
-    return channels, sources, [Finding("no_readable_text", "warning", text, where=silent[0])]
+    return channels, sources, [Finding("no_readable_text", "warning", silent[0], text=text)]
 
 
 def _is_text(index: LogIndex, command: DriveSource) -> bool:
@@ -522,7 +522,7 @@ def _list_contradictions(
                 f"the {one.source.replace('_', ' ')} of the log indicates a {one.vehicle.name} "
                 f"({', '.join(differing)}), but {named}"
             )
-            yield Finding("vehicle_contradiction", "warning", text, where="vehicle")
+            yield Finding("vehicle_contradiction", "warning", "vehicle", text=text)
 
 
 def _compare(
@@ -545,7 +545,7 @@ def _compare(
                 f"{ratings[0].same_as}, computed from the wheels, and says nothing about the ground; "
                 "record a localization (lidar, camera, satellites, motion capture)"
             )
-            findings.append(Finding("pose_from_wheels", "error", text, where="pose"))
+            findings.append(Finding("pose_from_wheels", "error", "pose", text=text))
         useless = ratings[0].refusal if ratings and ratings[0].stands else ""
         if ratings and ratings[0].from_wheels and not ratings[0].same_as:
             useless = (
@@ -559,14 +559,14 @@ def _compare(
             )
             if alone.recording is not None:
                 text = f"not used: the poses of {ratings[0].source}: {useless}"
-                unused = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
+                unused = Finding("numbers_not_used", "warning", ratings[0].source.topic, text=text)
                 return replace(alone, findings=(*alone.findings, unused))
         if useless and ratings[0].from_wheels:
             text = (
                 "the pose comes from the wheels, so forward slip is not observable: "
                 f"{ratings[0].source} is computed from them, and the log has no other pose"
             )
-            findings.append(Finding("pose_from_wheels", "error", text, where=str(ratings[0].source)))
+            findings.append(Finding("pose_from_wheels", "error", str(ratings[0].source), text=text))
     recording = examine(replace(given, sources=sources))
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
@@ -576,7 +576,7 @@ def _compare(
                 f"{other.source} is taken for the pose, and not {ratings[0].source}: the vehicle moves as it "
                 "does; the other is of another body"
             )
-            findings.append(Finding("pose_of_another", "info", text, where="pose"))
+            findings.append(Finding("pose_of_another", "info", "pose", text=text))
             ratings = (other, *(one for one in ratings if one is not other))
             recording = made
             break
@@ -650,7 +650,7 @@ def _fit_vehicle(
             raise problem
         why = _explain_left_out(recording, str(sources.wheels), contradiction)
         text = f"not used: {sources.wheels}: {why}"
-        findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
+        findings.append(Finding("wheels_left_out", "warning", "wheels", text=text))
         sources, is_body, kind = replace(sources, wheels=None), True, kind.replace("mecanum", "omni")
     if kind == "ackermann" and "wheelbase_m" not in values:
         if standing_in is not None:
@@ -669,7 +669,7 @@ def _fit_vehicle(
         errors={} if is_body else errors,
     )
     is_given = all(key in known for key in values) and not is_body
-    findings.append(Finding("vehicle_fitted", "info" if is_given else "warning", text, where="vehicle"))
+    findings.append(Finding("vehicle_fitted", "info" if is_given else "warning", "vehicle", text=text))
     return replace(
         chosen,
         vehicle=vehicle,
@@ -731,5 +731,5 @@ def _take_unit_wheels(
     )
     bare = {"name": "fitted vehicle", "wheelbase_m": None, "id": "fitted_wheels", "kind": kind}
     vehicle = msgspec.structs.replace(chosen.vehicle, **{**bare, **assumed, **values}, stand_ins=[*assumed])
-    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
+    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", "vehicle", text=text))
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)

@@ -96,7 +96,7 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
             "their names ([wheels] in run.toml names others)"
         )
         taken = choose(index, configuration, options.overrides)
-        finding = Finding("sides_by_name", "warning", text, where=sides.topic)
+        finding = Finding("sides_by_name", "warning", sides.topic, text=text)
         chosen = replace(taken, findings=(*taken.findings, finding))
     chosen = report_unused(chosen, index)
     require_sources(chosen, index, options)
@@ -308,7 +308,7 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
             f"left_topic = {left}; right_topic = {right}{_ANY_UNIT}"
         )
         severity: Severity = "info" if getattr(sources, role) else "warning"
-        findings.append(Finding("numbers_not_used", severity, text, where=topic))
+        findings.append(Finding("numbers_not_used", severity, topic, text=text))
     return findings
 
 
@@ -366,7 +366,7 @@ def _offer(sides: _Sides) -> Finding:
         f"right wheels, in run.toml: [{sides.role}] left_topic = {_quote(sides.left)}; "
         f"right_topic = {_quote(sides.right)}{unit}"
     )
-    return Finding("numbers_not_used", "warning", text, where=sides.topic)
+    return Finding("numbers_not_used", "warning", sides.topic, text=text)
 
 
 def _quote(name: str) -> str:
@@ -391,7 +391,7 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
                 f"[command] speed_topic = {_quote(f'{topic}.axes[1]')}; "
                 f"yaw_rate_topic = {_quote(f'{topic}.axes[0]')} (which axes, the set-up of its driver says)"
             )
-            yield Finding("numbers_not_used", "warning", text, where=topic)
+            yield Finding("numbers_not_used", "warning", topic, text=text)
             continue
         ends = {path: path.rpartition(".")[2].lower() for path in paths}
         speeds = [path for path, end in ends.items() if _SPEED.search(end)]
@@ -404,4 +404,4 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
                 f"not used: {topic} (a speed and a turn), whose meaning is not known; if it is the command, "
                 f"in run.toml: [command] speed_topic = {speed}; {key} = {turn}"
             )
-            yield Finding("numbers_not_used", "warning", text, where=topic)
+            yield Finding("numbers_not_used", "warning", topic, text=text)

@@ -68,7 +68,7 @@ def resolve_losses(case: Case, command: Candidate | None) -> None:
             ". The last one is held, for no signal shows whether the base got them: if it did, a lag of the "
             f"drive is up to {1e3 * period * share / (1.0 - share):.0f} ms longer than found"
         )
-    case.findings.append(Finding("commands_lost", "warning", text, where="command", value=share))
+    case.findings.append(Finding("commands_lost", "warning", "command", {"value": share}, text=text))
 
 
 def find_losses(reading: Reading) -> tuple[float, float]:

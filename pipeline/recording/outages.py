@@ -446,7 +446,7 @@ def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: 
     )
     begin = None if np.isinf(outages[0].start) else outages[0].start
     case.findings.append(
-        Finding("encoder_dead", "warning", text, where="wheels", t_start=begin, count=len(outages))
+        Finding("encoder_dead", "warning", "wheels", {"count": len(outages)}, text=text, t_start=begin)
     )
     return True
 

@@ -71,7 +71,7 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
     is_usable = is_rest_used or is_replaced
     name = "command_mixed" if is_usable else "commands_mixed"
     severity: Literal["warning", "error"] = "warning" if is_usable else "error"
-    case.findings.append(Finding(name, severity, text, where="command", value=zeros, count=len(spans)))
+    case.findings.append(Finding(name, severity, "command", {"value": zeros, "count": len(spans)}, text=text))
     if is_replaced:
         case.leave_out(command.source)
         return None

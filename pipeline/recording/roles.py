@@ -71,7 +71,7 @@ def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
             reading = case.read(source, is_measured=True)
         if reading is not None and (why := _explain_of_ground(reading, motion)):
             text = f"not used: {source}: {why}"
-            case.findings.append(Finding("numbers_not_used", "info", text, where=source.signals[0].topic))
+            case.findings.append(Finding("numbers_not_used", "info", source.signals[0].topic, text=text))
             case.leave_out(source)
     case.moves_sideways = given.may_move_sideways(case.sources)
 
@@ -149,7 +149,7 @@ def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]
             f"not used: {one.source}: its speeds have no sign: they are never below zero, though the "
             "body is driven forward and backward"
         )
-        case.findings.append(Finding("wheels_unsigned", "warning", text, where="wheels"))
+        case.findings.append(Finding("wheels_unsigned", "warning", "wheels", text=text))
         case.leave_out(one.source)
     return signed
 
@@ -182,7 +182,7 @@ def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | N
     if command is not None and _is_no_command(command):
         text = f"not used: {command.source}: it measures the motion, which equals it at once"
         where = command.source.signals[0].topic
-        case.findings.append(Finding("numbers_not_used", "info", text, where=where))
+        case.findings.append(Finding("numbers_not_used", "info", where, text=text))
         case.sources, command = replace(case.sources, command=None), None
     wheels = _find_wheels(case, drives, command)
     if wheels is not None and command is not None and wheels.source.signals == command.source.signals:
@@ -233,7 +233,7 @@ def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | N
         return wheels
     why = "no speeds of both sides are found in it" if wheels is None else "the motion does not follow it"
     text = f"not used: {source}: {why}; {others[0].source} is taken for the wheels"
-    case.findings.append(Finding("wheels_left_out", "info", text, where="wheels"))
+    case.findings.append(Finding("wheels_left_out", "info", "wheels", text=text))
     return others[0]
 
 
@@ -276,7 +276,7 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
             f"{case.sources.pose} move as {first.source} commands ([command] topic in run.toml takes it all "
             "the same)"
         )
-        case.findings.append(Finding("not_driven", "error", text, where="pose"))
+        case.findings.append(Finding("not_driven", "error", "pose", text=text))
         return
     if made is None or first.reading.form != "body":
         return
@@ -293,7 +293,7 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
         f"the poses of {case.sources.pose} move {moved:.3g} m, but not as {first.source} commands: they are "
         "of another body, or something else drives it ([pose] and [command] in run.toml name others)"
     )
-    case.findings.append(Finding("not_driven", "error", text, where="pose", value=moved))
+    case.findings.append(Finding("not_driven", "error", "pose", {"value": moved}, text=text))
 
 
 def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
@@ -305,7 +305,7 @@ def _report_command(case: Case, chosen: Candidate, other: Candidate) -> None:
         f"{chosen.source} is taken for the command, and not {other.source}: the motion follows the first "
         "later, and the second measures it or is not followed; [command] in run.toml names another"
     )
-    case.findings.append(Finding("role_by_motion", "info", text, where="command"))
+    case.findings.append(Finding("role_by_motion", "info", "command", text=text))
 
 
 def resolve_stamps(case: Case, command: Candidate | None) -> None:
@@ -373,7 +373,7 @@ def leave_out_steered(case: Case, wheels: Candidate) -> bool:
         "each wheel by itself); steering_joint and left and right under [wheels] and "
         '[vehicle] kind = "ackermann" in run.toml take it for a car'
     )
-    case.findings.append(Finding("wheels_steered", "warning", text, where="wheels"))
+    case.findings.append(Finding("wheels_steered", "warning", "wheels", text=text))
     case.sources = replace(case.sources, wheels=None)
     return True
 
@@ -427,4 +427,4 @@ def report_turn(case: Case, command: Candidate | None) -> None:
         f'times their tangent: read so, as speed_topic = "{speed}" and steering_topic = "{turn}" under '
         "[command] in run.toml do"
     )
-    case.findings.append(Finding("command_corrected", "warning", text, where="command"))
+    case.findings.append(Finding("command_corrected", "warning", "command", text=text))

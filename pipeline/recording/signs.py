@@ -56,7 +56,7 @@ def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Moti
             "them: their frame may be turned by 90 degrees, which too little tells; it is taken as recorded "
             f"(heading_deg = {other_deg:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)"
         )
-        case.findings.append(Finding("pose_undecided", "warning", text, where="pose", value=other_deg))
+        case.findings.append(Finding("pose_undecided", "warning", "pose", {"value": other_deg}, text=text))
     if not margin:
         return motion
     if section.heading_deg is not None:
@@ -64,14 +64,14 @@ def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Moti
             f"by the motion the heading of {source} is {turned.offset_deg:.0f} degrees off (or as much "
             "less half a turn), but [pose] in run.toml gives heading_deg, which is taken as it is given"
         )
-        case.findings.append(Finding("pose_contradicted", "warning", text, where="pose", value=margin))
+        case.findings.append(Finding("pose_contradicted", "warning", "pose", {"value": margin}, text=text))
         return motion
     if turned.flip:
         text = (
             f"the headings of {source} turn against its own path: its frame is of the other hand; "
             "correct what publishes it"
         )
-        case.findings.append(Finding("pose_flipped", "error", text, where="pose", value=margin))
+        case.findings.append(Finding("pose_flipped", "error", "pose", {"value": margin}, text=text))
     for one in readings:
         one.explain(turned)
     return turned
@@ -133,7 +133,7 @@ def report_axes(case: Case, command: Candidate | None) -> None:
         f"the commands of {command.source} are along the axes of a map, and the base turns them by its "
         "heading (field-centric driving): record them as they are along the body's own axes"
     )
-    case.findings.append(Finding("command_of_map", "error", text, where="command", value=margin))
+    case.findings.append(Finding("command_of_map", "error", "command", {"value": margin}, text=text))
 
 
 def report_speed_alone(case: Case, drives: Sequence[Candidate | None]) -> None:
@@ -150,7 +150,7 @@ def report_speed_alone(case: Case, drives: Sequence[Candidate | None]) -> None:
             "errors of heading, and what they make of positions, say nothing (yaw_rate_topic and speed_topic "
             "in run.toml name two topics, as of a gyro)"
         )
-        case.findings.append(Finding("no_yaw_rate", "warning", text, where=drive.source.signals[0].topic))
+        case.findings.append(Finding("no_yaw_rate", "warning", drive.source.signals[0].topic, text=text))
 
 
 def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
@@ -193,7 +193,7 @@ def _report_fault(
     role = "wheels" if drive is wheels else "command"
     faults = "; or ".join(_FAULTS[one] for one in (fault, *others))
     text = f"{drive.source} contradicts all other signals: {faults}"
-    case.findings.append(Finding(f"{role}_reversed", "error", text, where=role))
+    case.findings.append(Finding(f"{role}_reversed", "error", role, text=text))
 
 
 def _report_either(
@@ -220,7 +220,7 @@ def _report_either(
         f"{' and '.join(verbs[axis] for axis in axes)} opposite ways, and no third signal tells which of "
         f"them is wrong: either {options}"
     )
-    case.findings.append(Finding("signs_contradict", "error", text, where=f"{against[0]}, pose"))
+    case.findings.append(Finding("signs_contradict", "error", f"{against[0]}, pose", text=text))
 
 
 def _name_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> str:
@@ -268,7 +268,7 @@ def report_mounting(case: Case, drives: Sequence[Candidate | None]) -> None:
             "body crabs, as on a bent axle or along a slope; no other signal tells which (heading_deg = "
             f"{given + degrees:.1f} under [pose] in run.toml turns it)"
         )
-        case.findings.append(Finding("pose_angle", "info", text, where="pose", value=angle))
+        case.findings.append(Finding("pose_angle", "info", "pose", {"value": angle}, text=text))
     if abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and known[0].form != "steering":
         text = (
             f"the body turns about a point {format_length(abs(lever))} "
@@ -276,4 +276,4 @@ def report_mounting(case: Case, drives: Sequence[Candidate | None]) -> None:
             f"{'behind' if lever > 0.0 else 'ahead of'} that of the poses of {pose}: they are of a sensor "
             "that is mounted there, or the wheels do not grip alike front and rear"
         )
-        case.findings.append(Finding("pose_lever", "info", text, where="pose", value=lever))
+        case.findings.append(Finding("pose_lever", "info", "pose", {"value": lever}, text=text))

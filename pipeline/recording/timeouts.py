@@ -139,10 +139,9 @@ def _report(timeout: CommandTimeout, hold_s: float, *, in_bursts: bool) -> Findi
     return Finding(
         "command_timeout",
         "warning" if in_bursts else "info",
-        text,
-        where="command",
-        value=timeout.seconds,
-        count=timeout.silences,
+        "command",
+        {"value": timeout.seconds, "count": timeout.silences},
+        text=text,
     )
 
 
@@ -436,7 +435,7 @@ def resolve_delay(
             f"lag of {made.lag:.2f} s: the drive answers so late, or the stamps are early; no other signal "
             f"tells which (late_s = {-made.delay:.2f} under [command] in run.toml takes them for early)"
         )
-        case.findings.append(Finding("command_delay", "info", text, where="command", value=made.delay))
+        case.findings.append(Finding("command_delay", "info", "command", {"value": made.delay}, text=text))
         return
     late = round(-made.delay, 2)
     topics = [*(one.topic for one in command.source.signals), *beside]
@@ -449,7 +448,7 @@ def resolve_delay(
             f"stamps are late, or those of {followed} early, and no other signal tells which (late_s = "
             f"{late:g} under [command] in run.toml corrects the first)"
         )
-        case.findings.append(Finding("command_late", "warning", text, where="command", value=late))
+        case.findings.append(Finding("command_late", "warning", "command", {"value": late}, text=text))
         return
     what = f"the stamps of {command.source} are {late:.2f} s late, for {followed} follow it before it is sent"
     case.correct("command", what, f"late_s = {late:g}", {"late_s": late})

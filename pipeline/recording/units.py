@@ -209,7 +209,7 @@ def _report_units(
                 f"{of} may be in {other}{seen}; it is taken as {unit}, and no other signal tells which "
                 f'({key} = "{other}" under [{role}] in run.toml takes it so, {key} = "{unit}" settles it)'
             )
-            case.findings.append(Finding("unit_undecided", "warning", text, where=role, value=gain))
+            case.findings.append(Finding("unit_undecided", "warning", role, {"value": gain}, text=text))
 
 
 def _find_wheel_unit(case: Case, command: Candidate | None, wheels: Candidate) -> None:

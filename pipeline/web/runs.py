@@ -5,6 +5,7 @@ import msgspec
 from pipeline.results import find_refusal, read_findings
 from pipeline.store import MANIFEST, REPORT, Manifest, Store, StoreError, read_stored
 from pipeline.web import WorkbenchError
+from pipeline.words import format_finding
 
 
 class _Loss(msgspec.Struct):
@@ -16,6 +17,8 @@ class _Finding(msgspec.Struct):
     id: str = ""
     severity: str = ""
     text: str = ""
+    where: str | None = None
+    values: dict[str, object] = {}
 
 
 class _Log(msgspec.Struct):
@@ -48,12 +51,13 @@ def summarize_run(manifest: Manifest) -> dict[str, object]:
     except StoreError:
         summary = _Summary()
     content = msgspec.to_builtins(summary)
+    refusal = find_refusal(read_findings(content))
     return {
         **content,
         **content.pop("log"),
         "run": manifest.run,
         "analyzed_s": (manifest.folder.parent / MANIFEST).stat().st_mtime,
-        "refusal": find_refusal(read_findings(content)),
+        "refusal": "" if refusal is None else format_finding(refusal),
         "report": REPORT in manifest.files,
     }
 

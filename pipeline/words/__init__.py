@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         format_remaining_error,
         name_span,
     )
+    from pipeline.words.findings import format_finding
     from pipeline.words.models import (
         describe_step,
         format_contest,
