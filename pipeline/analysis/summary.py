@@ -21,7 +21,14 @@ from pipeline.estimation.stored_diagnosis import (
 )
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.recording.log_setup import LogSetup
-from pipeline.results import RunDiagnosis, find_refusal, read_finding_table, read_result, to_json
+from pipeline.results import (
+    RunDiagnosis,
+    find_refusal,
+    parse_values,
+    read_finding_table,
+    read_result,
+    to_json,
+)
 from pipeline.stages import SUMMARY_DIGITS, Finding, list_wanted, pick_row, round_number, summarize_inputs
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store
 
@@ -204,7 +211,7 @@ def list_findings(findings: pl.DataFrame) -> list[JSON]:
     columns = ["id", "severity", "text", "where", "t_start", "t_end", "value", "count", "stage", "values"]
     # Severities are an Enum, ordered from info to error.
     ordered = findings.select(columns).sort("severity", descending=True, maintain_order=True)
-    return [{**row, "values": json.loads(row["values"])} for row in ordered.to_dicts()]
+    return [{**row, "values": parse_values(row["values"])} for row in ordered.to_dicts()]
 
 
 _MOST_RUNS = 2000

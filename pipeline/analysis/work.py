@@ -15,6 +15,7 @@ from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_mem
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, LogData, Loss, read_topics
 from pipeline.recording.log_setup import LogSetup
+from pipeline.results import round_numbers
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
 from pipeline.stages import (
@@ -152,7 +153,7 @@ class Work:
         rows = [
             {
                 "stage": stage, "id": one.id, "severity": one.severity, "where": one.where,
-                "values": json.dumps(one.values), "text": format_finding(one),
+                "values": json.dumps(round_numbers(one.values, None)), "text": format_finding(one),
                 "t_start": one.t_start, "t_end": one.t_end, "value": one.value, "count": one.count,
             }
             for one in findings

@@ -162,7 +162,7 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
         "complete": not seen.losses,
         "losses": [{name: getattr(loss, name) for name in _LOSS} for loss in seen.losses],
         "unchecked": seen.unchecked or None,
-        "notes": list(seen.notes),
+        "notes": list(map(format_finding, seen.notes)),
         "metadata": {name: dict(record) for name, record in index.metadata.items()},
         "topics": [vars(topic) for topic in seen.topics],
         "vehicle": seen.vehicle.id if seen.vehicle else None,
@@ -204,7 +204,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     unchecked = f", unchecked: {seen.unchecked}" if seen.unchecked else ""
     lines.append(f"health    {'complete' if not seen.losses else 'with losses'}{unchecked}")
     lines += _cut([f"  lost    {loss.text}" for loss in seen.losses], everything=everything)
-    lines += _cut([f"  note    {note}" for note in seen.notes], everything=everything)
+    lines += _cut([f"  note    {format_finding(note)}" for note in seen.notes], everything=everything)
     if everything:
         for name, record in index.metadata.items():
             texts = [f"{key} = {' '.join(value.split())}" for key, value in record.items()]

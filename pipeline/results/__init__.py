@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         list_excess,
         list_rises,
         measure_excess,
+        parse_values,
         rank_main,
         read_error,
         read_finding_table,
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
         Unobservable,
         Value,
         read_result,
+        round_numbers,
         split_determined,
         to_json,
     )

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 from pipeline.core import JSON_DIGITS, format_share, mapping_in, number_in, objects_in, round_digits
 from pipeline.recording import FAULTS
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from pipeline.models import Effect, ModelFile
     from pipeline.sources import Vehicle
+    from pipeline.store import JSON
 
 Entry = TypeVar("Entry")
 
@@ -56,9 +57,16 @@ def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
 
 def read_finding_table(table: pl.DataFrame) -> tuple[Finding, ...]:
     """The findings of a run's table."""
-    return tuple(
-        _read_finding({**row, "values": json.loads(row["values"])}) for row in table.iter_rows(named=True)
-    )
+    rows = table.iter_rows(named=True)
+    return tuple(_read_finding({**row, "values": parse_values(row["values"])}) for row in rows)
+
+
+def parse_values(text: object) -> JSON:
+    """The values of a finding from their column; empty where it is no JSON."""
+    try:
+        return cast("JSON", json.loads(str(text)))
+    except (ValueError, RecursionError):
+        return {}
 
 
 def _read_finding(content: Mapping[str, object]) -> Finding:
@@ -68,7 +76,6 @@ def _read_finding(content: Mapping[str, object]) -> Finding:
         "error" if severity == "error" else "warning" if severity == "warning" else "info",
         str(content.get("where") or ""),
         mapping_in(content, "values"),
-        str(content.get("text") or ""),
         t_start=number_in(content, "t_start"),
         t_end=number_in(content, "t_end"),
     )

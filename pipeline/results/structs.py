@@ -539,13 +539,13 @@ def to_json(result: msgspec.Struct) -> dict[str, Json]:
     return cast("dict[str, Json]", round_numbers(msgspec.to_builtins(result)))
 
 
-def round_numbers(value: object) -> object:
-    """The numbers of an object with the digits that JSON has, None for those that are not finite."""
+def round_numbers(value: object, digits: int | None = JSON_DIGITS) -> object:
+    """An object with numbers of so many digits, by default of JSON; None for those that are not finite."""
     if isinstance(value, float):
-        return finite_or_none(value, JSON_DIGITS)
+        return finite_or_none(value, digits)
     if isinstance(value, dict):
-        return {key: round_numbers(one) for key, one in value.items()}
-    return [round_numbers(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: round_numbers(one, digits) for key, one in value.items()}
+    return [round_numbers(one, digits) for one in value] if isinstance(value, list | tuple) else value
 
 
 def read_result(content: Mapping[str, object], kind: type[Result], where: Path = Path()) -> Result:

@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.core import PAUSE_NS, Flags, Floats, Ints, format_duration, robust_spread
+from pipeline.core import PAUSE_NS, Flags, Floats, Ints, robust_spread
 from pipeline.logs import LATEST_NS
 from pipeline.stages import timing
 from pipeline.stages.findings import Finding, Severity, StageError
@@ -178,21 +178,6 @@ def find_pauses(log_times: Iterable[Stamps]) -> list[tuple[int, int]]:
     log = np.sort(np.concatenate([np.empty(0, dtype=np.int64), *log_times]), kind="stable")
     last = np.flatnonzero(np.diff(log) > PAUSE_NS)
     return list(zip(log[last].tolist(), log[last + 1].tolist(), strict=True))
-
-
-def describe_pauses(pauses: Sequence[tuple[int, int]], silent: str = "nothing") -> str:
-    """A sentence on silences of a recording, without full stop.
-
-    Args:
-        pauses: as of `find_pauses`, at least one.
-        silent: what was not recorded.
-    """
-    longest = format_duration(max(after - last for last, after in pauses) / 1e9)
-    most = longest if len(pauses) == 1 else f"up to {longest}"
-    return (
-        f"{silent} was recorded for {most}: the recorder's clock was set, or the recording paused; "
-        "that time does not count"
-    )
 
 
 def _close_pauses(

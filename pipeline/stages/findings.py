@@ -51,7 +51,6 @@ class Finding(msgspec.Struct, frozen=True, omit_defaults=True):
     severity: Severity
     where: str = ""
     values: Mapping[str, Any] = {}
-    text: str = ""
     t_start: float | None = None
     t_end: float | None = None
 

@@ -2,6 +2,7 @@
 
 import msgspec
 
+from pipeline.core import pick
 from pipeline.results import find_refusal, read_findings
 from pipeline.store import MANIFEST, REPORT, Manifest, Store, StoreError, read_stored
 from pipeline.web import WorkbenchError
@@ -11,14 +12,6 @@ from pipeline.words import format_finding
 class _Loss(msgspec.Struct):
     kind: str = ""
     text: str = ""
-
-
-class _Finding(msgspec.Struct):
-    id: str = ""
-    severity: str = ""
-    text: str = ""
-    where: str | None = None
-    values: dict[str, object] = {}
 
 
 class _Log(msgspec.Struct):
@@ -40,7 +33,7 @@ class _Summary(msgspec.Struct):
     distance_m: float | None = None
     leading_input: str | None = None
     verdict: str | None = None
-    findings: list[_Finding] = []
+    findings: list[dict[str, object]] = []
     log: _Log = msgspec.field(default_factory=_Log)
 
 
@@ -51,10 +44,12 @@ def summarize_run(manifest: Manifest) -> dict[str, object]:
     except StoreError:
         summary = _Summary()
     content = msgspec.to_builtins(summary)
-    refusal = find_refusal(read_findings(content))
+    findings = read_findings(content)
+    refusal = find_refusal(findings)
     return {
         **content,
         **content.pop("log"),
+        "findings": [{**pick(one, "id", "severity"), "text": format_finding(one)} for one in findings],
         "run": manifest.run,
         "analyzed_s": (manifest.folder.parent / MANIFEST).stat().st_mtime,
         "refusal": "" if refusal is None else format_finding(refusal),

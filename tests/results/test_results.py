@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 import msgspec
+import polars as pl
 import pytest
 from drawn_diagnoses import draw_diagnosis
 
@@ -21,7 +22,14 @@ from pipeline.results import (
     read_result,
     to_json,
 )
-from pipeline.results.reading import find_refusal, has_no_pose, measure_excess, read_findings, read_model
+from pipeline.results.reading import (
+    find_refusal,
+    has_no_pose,
+    measure_excess,
+    read_finding_table,
+    read_findings,
+    read_model,
+)
 from pipeline.stages import Finding
 from pipeline.words import format_finding
 from pipeline.words.objects import diagnosis_as_json
@@ -116,3 +124,9 @@ def test_findings_of_untrusted_results_are_texts() -> None:
     # Of values that are not those of its sentence, its id is shown.
     assert [format_finding(one) for one in findings] == ["5", "not moving"]
     assert not has_no_pose(findings)
+    table = pl.DataFrame(
+        {"id": "stuck", "severity": "warning", "values": [text]} for text in ("{", "[1]", "[" * 10**5)
+    )
+    assert set(map(format_finding, read_finding_table(table))) == {
+        format_finding(Finding("stuck", "warning"))
+    }
