@@ -207,3 +207,19 @@ def test_a_finding_of_an_error_says_what_the_error_says() -> None:
     assert format_finding(Finding("too_short", "warning", "diagnosis", values)) == values["error"]
     left_out = Finding("too_short", "warning", "diagnosis", {**values, "kind": "left out"})
     assert format_finding(left_out) == f"left out: {values['error']}"
+
+
+@pytest.mark.parametrize(
+    ("ends", "when"),
+    [
+        ({"start_s": 40.0, "end_s": 70.0}, "from 40 to 70 s"),
+        ({"start_s": 40.0}, "from 40 s on"),
+        ({"end_s": 70.0}, "until 70 s"),
+        ({}, "throughout"),
+    ],
+)
+def test_an_outage_is_said_with_the_ends_that_it_has(ends: dict[str, float], when: str) -> None:
+    stretch = {"side": "left", "reads": "zero", **ends}
+    values = {"stretches": [stretch], "witnesses": ["command", "pose"], "line": "ignore = []"}
+    text = format_finding(Finding("encoder_dead", "warning", "wheels", values))
+    assert f"reads nothing {when} (zero is recorded while the commands and the poses go on)" in text
