@@ -95,8 +95,8 @@ def _type_left_out(of: Values) -> str:
 
 
 def _interval_applied(of: Values) -> str:
-    says = " or ".join(map(repr, of["states"]))
-    return f"only stretches in which {of['where']} says {says} were used ({of['count']} of them)"
+    states = " or ".join(map(repr, of["states"]))
+    return f"only stretches in which {of['where']} says {states} were used ({of['count']} of them)"
 
 
 def _slope_by_imu(of: Values) -> str:
