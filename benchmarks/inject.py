@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from unittest.mock import patch
 
 import polars as pl
@@ -175,7 +175,7 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
     }
     return Answer(
         _list_numbers(told.effects),
-        {one.id: cast("float | None", one.value) for one in findings},
+        {one.id: one.value for one in findings},
         tuple(name for item in told.undecided for name in item.candidates),
         tuple(told.unobservable_why),
         estimates,

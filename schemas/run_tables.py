@@ -183,13 +183,14 @@ SEVERITIES = ("info", "warning", "error")
 class Findings(Table):
     """One row a finding."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     stage = schemas.text("stage that noticed it")
     id = dy.String(min_length=1, regex=r"^[a-z][a-z0-9_]*$", metadata={"description": "stable id"})
     severity = schemas.choice(SEVERITIES, "info, warning, or error: do not trust results")
     text = schemas.name("the finding in one sentence")
     where = schemas.text("topic, column or stretch of time; empty for the whole run")
+    values = schemas.text("numbers, texts and lists of the finding by name, as JSON")
     t_start = schemas.optional("s", "start of the stretch it concerns")
     t_end = schemas.optional("s", "end of the stretch it concerns")
     value = schemas.optional("1", "the number behind it, in the unit the text gives")

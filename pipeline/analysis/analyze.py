@@ -46,6 +46,7 @@ from pipeline.store import (
     stored_contexts,
     stored_keys,
 )
+from pipeline.words import format_finding
 
 if TYPE_CHECKING:
     from pipeline.report.scene import RunReport
@@ -77,7 +78,8 @@ class Outcome:
     @property
     def refusal(self) -> str:
         """Reason why slip is not observable in the log; empty if it is."""
-        return find_refusal(read_findings(self.summary))
+        refusal = find_refusal(read_findings(self.summary))
+        return "" if refusal is None else format_finding(refusal)
 
 
 def _ignore(stage: str) -> None:

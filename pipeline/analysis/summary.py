@@ -21,8 +21,15 @@ from pipeline.estimation.stored_diagnosis import (
 )
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.recording.log_setup import LogSetup
-from pipeline.results import Finding, RunDiagnosis, find_refusal, read_findings, read_result, to_json
-from pipeline.stages import SUMMARY_DIGITS, list_wanted, pick_row, round_number, summarize_inputs
+from pipeline.results import (
+    RunDiagnosis,
+    find_refusal,
+    parse_values,
+    read_finding_table,
+    read_result,
+    to_json,
+)
+from pipeline.stages import SUMMARY_DIGITS, Finding, list_wanted, pick_row, round_number, summarize_inputs
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store
 
 _Packages = Mapping[str, tuple[str, ...]]
@@ -108,7 +115,8 @@ def _diagnose(work: Work) -> RunDiagnosis:
         diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, notify=work.progress)
     except SlipError as error:
         # The slip of a log is valid even if it cannot be diagnosed.
-        return RunDiagnosis(work.run, findings=(Finding(error.code, str(error), "diagnosis", "warning"),))
+        refusal = Finding(error.code, "warning", "diagnosis", {"error": str(error)})
+        return RunDiagnosis(work.run, findings=(refusal,))
     for table in DIAGNOSED:
         frame = diagnosis.tabulate(table, work.run)
         if not frame.is_empty():
@@ -123,7 +131,7 @@ def judge_run(findings: pl.DataFrame, diagnosis: RunDiagnosis | None) -> str:
         findings: the run's findings.
         diagnosis: None if it was not requested.
     """
-    noted = read_findings({"findings": findings.to_dicts()}) if diagnosis is None else diagnosis.findings
+    noted = read_finding_table(findings) if diagnosis is None else diagnosis.findings
     if diagnosis is None and not find_refusal(noted):
         return ""
     from pipeline.words import format_refusal, format_verdict  # noqa: PLC0415 - heavy
@@ -200,9 +208,10 @@ def _summarize_topics(work: Work) -> dict[str, JSON]:
 
 def list_findings(findings: pl.DataFrame) -> list[JSON]:
     """Findings as JSON objects, errors first."""
-    columns = ["id", "severity", "text", "where", "t_start", "t_end", "value", "count", "stage"]
+    columns = ["id", "severity", "text", "where", "t_start", "t_end", "value", "count", "stage", "values"]
     # Severities are an Enum, ordered from info to error.
-    return list(findings.select(columns).sort("severity", descending=True, maintain_order=True).to_dicts())
+    ordered = findings.select(columns).sort("severity", descending=True, maintain_order=True)
+    return [{**row, "values": parse_values(row["values"])} for row in ordered.to_dicts()]
 
 
 _MOST_RUNS = 2000

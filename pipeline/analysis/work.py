@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_mem
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, LogData, Loss, read_topics
 from pipeline.recording.log_setup import LogSetup
+from pipeline.results import round_numbers
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
 from pipeline.stages import (
@@ -25,7 +27,6 @@ from pipeline.stages import (
     extract_tables,
     list_wanted,
     slip_stage,
-    tabulate_findings,
     velocity,
 )
 from pipeline.store import (
@@ -39,7 +40,8 @@ from pipeline.store import (
     stored_contexts,
     stored_keys,
 )
-from schemas import contract_of
+from pipeline.words import format_finding
+from schemas import contract_of, tabulate
 
 
 def hash_model(path: Path | None) -> str | None:
@@ -148,8 +150,15 @@ class Work:
         self.findings.append(before.read("findings").filter(pl.col("stage") == stage))
 
     def _keep_findings(self, stage: str, findings: tuple[Finding, ...]) -> None:
-        frame = tabulate_findings(stage, findings)
-        self.findings.append(self._identify("findings", frame))
+        rows = [
+            {
+                "stage": stage, "id": one.id, "severity": one.severity, "where": one.where,
+                "values": json.dumps(round_numbers(one.values, None)), "text": format_finding(one),
+                "t_start": one.t_start, "t_end": one.t_end, "value": one.value, "count": one.count,
+            }
+            for one in findings
+        ]  # fmt: skip
+        self.findings.append(self._identify("findings", tabulate("findings", rows)))
 
     def write(self, table: str, frame: pl.DataFrame) -> TableEntry:
         """Write a table of this run, with the columns that identify the run, and the facts it declares."""
@@ -209,24 +218,16 @@ class Work:
             Finding(
                 "quarantined_rows",
                 "warning",
-                f"{report.quarantined} rows of {name} break the contract "
-                f"({', '.join(sorted(report.rules))}): they were moved to quarantine_{name}",
-                where=name,
-                count=report.quarantined,
+                name,
+                {"count": report.quarantined, "rules": sorted(report.rules)},
             )
             for name, report in broken.items()
             if report.quarantined != counted.get(name)
         ]
-        notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
-        notes += [Finding("log_unchecked", "info", data.unchecked, where="log")] if data.unchecked else []
+        notes = [Finding("log_note", "info", "log", {"note": note}) for note in data.notes]
+        notes += [Finding("log_unchecked", "info", "log", {"why": data.unchecked})] if data.unchecked else []
         notes += [
-            Finding(
-                "repeated_messages",
-                "warning",
-                f"{count} messages of {topic} are byte-for-byte copies of others: duplicates were removed",
-                where=topic,
-                count=count,
-            )
+            Finding("repeated_messages", "warning", topic, {"kind": "removed", "count": count})
             for topic, count in data.repeated.items()
         ]
         held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])

@@ -27,7 +27,7 @@ from pipeline.core import (
 )
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, has_no_pose, read_findings, read_result
+from pipeline.results import RunDiagnosis, has_no_pose, key_finding, read_findings, read_result
 from pipeline.words.diagnosis import list_lines
 
 if TYPE_CHECKING:
@@ -132,9 +132,9 @@ def format_run(
     is_excluded = RunReport(summary).refusal
     # Those of the run and of its diagnosis that need attention, except what the verdict says.
     findings = read_findings(summary)
-    known = {finding.text for finding in findings}
+    known = set(map(key_finding, findings))
     own = read_findings(mapping_in(summary, "diagnosis"))
-    every = [*findings, *(one for one in own if one.text not in known)]
+    every = [*findings, *(one for one in own if key_finding(one) not in known)]
     # If the data are invalid, this is stated first.
     lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
@@ -179,7 +179,7 @@ def _format_head(summary: Summary) -> list[str]:
     state = "log complete" if not losses else "log with losses"
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
     # The verdict states an error without the mark of a finding.
-    errors = count_serious(objects_in(summary, "findings")).get("error")
+    errors = count_serious(read_findings(summary)).get("error")
     state += f", {errors}" if errors else ""
     if gaps:
         count, longest = cast("int", gaps[0]["count"]), number_in(gaps[0], "value")

@@ -174,7 +174,9 @@ def _apply(runs: Sequence[results.RunDiagnosis], path: Path, *, quiet: bool) -> 
     proposal = next(filter(None, map(results.read_model, runs)), None)
     if proposal is None:
         refusals = (results.find_refusal(run.findings) for run in runs)
-        what = f"no model can be proposed: {next(filter(None, refusals), 'nothing could be judged')}"
+        refusal = next(filter(None, refusals), None)
+        why = "nothing could be judged" if refusal is None else words.format_finding(refusal)
+        what = f"no model can be proposed: {why}"
         raise SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
     models.write_model(proposal, path)
     if not quiet:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline import models, store
+from pipeline import models, store, words
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
@@ -161,7 +161,7 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
         "complete": not seen.losses,
         "losses": [{name: getattr(loss, name) for name in _LOSS} for loss in seen.losses],
         "unchecked": seen.unchecked or None,
-        "notes": list(seen.notes),
+        "notes": list(map(words.format_finding, seen.notes)),
         "metadata": {name: dict(record) for name, record in index.metadata.items()},
         "topics": [vars(topic) for topic in seen.topics],
         "vehicle": seen.vehicle.id if seen.vehicle else None,
@@ -203,7 +203,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
     unchecked = f", unchecked: {seen.unchecked}" if seen.unchecked else ""
     lines.append(f"health    {'complete' if not seen.losses else 'with losses'}{unchecked}")
     lines += _cut([f"  lost    {loss.text}" for loss in seen.losses], everything=everything)
-    lines += _cut([f"  note    {note}" for note in seen.notes], everything=everything)
+    lines += _cut([f"  note    {words.format_finding(note)}" for note in seen.notes], everything=everything)
     if everything:
         for name, record in index.metadata.items():
             texts = [f"{key} = {' '.join(value.split())}" for key, value in record.items()]
@@ -225,7 +225,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
             lines += _format_ratings(seen.choice.ratings)
             lines += _format_evidence(seen.choice.recording)
         findings = sorted(seen.choice.findings, key=lambda one: one.severity == "info")
-        notes += [f"note      {finding.text}" for finding in findings]
+        notes += [f"note      {words.format_finding(finding)}" for finding in findings]
     lines += _cut(notes, everything=everything)
     if seen.problem:
         why = f"{seen.problem.what}. {seen.problem.hint.rstrip('.')}."

@@ -16,7 +16,7 @@ from pipeline.datasets.pooling import (
     measure_difficulty,
 )
 from pipeline.estimation.stored_diagnosis import DIAGNOSED
-from pipeline.results import find_refusal, read_findings
+from pipeline.results import FATAL
 from pipeline.run import GROUND_UNOBSERVABLE
 from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
 from pipeline.store import DIAGNOSIS, Manifest, Store, StoreError, date_runs
@@ -291,9 +291,8 @@ def find_run_refusal(manifest: Manifest) -> str:
     """Reason why slip is not observable in a run; empty if it is."""
     if "findings" not in manifest.tables or manifest.find_damage(["findings"]):
         return ""
-    return find_refusal(
-        read_findings({"findings": manifest.read("findings").select("id", "text").to_dicts()})
-    )
+    refused = manifest.read("findings").filter(pl.col("id").is_in(FATAL))
+    return "" if refused.is_empty() else str(refused["text"][0])
 
 
 def _lacks_pose(manifest: Manifest) -> bool:

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, enumerate_texts, format_errors, suffix_unit
+from pipeline.core import Flags, Floats
 from pipeline.estimation.decision import LEAST_T, list_costs
 from pipeline.estimation.folds import refit
 from pipeline.estimation.held_out import find_in_test, refit_fold, score
-from pipeline.models import name_term
-from pipeline.results import CHANGE, ERRORS_OVER_2S, Finding
+from pipeline.results import CHANGE, ERRORS_OVER_2S
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -157,20 +157,19 @@ def _report(
         others: ids of effects whose numbers change significantly as well.
     """
     values = [side.get(number) for side in sides]
-    change, effect = abs(values[1] - values[0]), sides[0].find(number.effect)
-    about = "" if effect is None else effect.parameter(number.name).about
-    places = max(1 - math.floor(math.log10(change)), 0) if change > 0.0 else 0
-    before, after = (f"{value:.{places}f}{suffix_unit(number.unit)}" for value in values)
-    beside = f" (perhaps {enumerate_texts([name_term(one) for one in others])}, too)" if others else ""
-    text = (
-        f"the {name_term(number.effect)} changes {since:.0f} s after the start of the run{beside}: its "
-        f"{about} is {before} before and {after} after; "
-        f"with a model for each part {format_errors(*errors.values())} remain"
-    )
-    return Finding(
-        CHANGE, text, number.effect, "warning", parameter=number.name, time=round(since, 1),
-        before=values[0], after=values[1],
-    )  # fmt: skip
+    effect = sides[0].find(number.effect)
+    shown = {
+        "parameter": number.name,
+        "about": "" if effect is None else effect.parameter(number.name).about,
+        "unit": number.unit,
+        "time": round(since, 1),
+        "since_s": since,
+        "before": values[0],
+        "after": values[1],
+        "others": list(others),
+        "errors": list(errors.values()),
+    }
+    return Finding(CHANGE, "warning", number.effect, shown)
 
 
 def _is_lower(errors: Mapping[str, float], than: HeldOut) -> bool:

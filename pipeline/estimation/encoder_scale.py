@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from pipeline.core import format_share
 from pipeline.models import find_effect
-from pipeline.results import Finding, Named, RunDiagnosis, Value
+from pipeline.results import Named, RunDiagnosis, Value
 from pipeline.run import MotionRun
+from pipeline.stages import Finding
 
 GIVEN: Final = "encoder_scale_given"
 """Finding of a run whose configuration says the scale: it is not estimated."""
@@ -45,16 +45,7 @@ class EncoderScale:
 
     def report(self) -> Finding:
         """The finding, with the line of run.toml that mends it."""
-        direction = "low" if self.value < 1.0 else "high"
-        text = (
-            f"the encoders read {format_share(abs(self.value - 1.0))} {direction}: the body moves as "
-            f"commanded, while the wheels seem to turn {self.value:.3g} times as fast as commanded and the "
-            "body to move "
-            f"{self.radius:.3g} times as far as they turn. The readings were corrected for the effects; "
-            f"scale = {1.0 / self.value:.4g} under [wheels] in run.toml corrects the tables too. If instead "
-            "the wheels have another radius and the drive has that gain by coincidence, scale = 1 names both"
-        )
-        return Finding("encoder_scale", text, "wheels", "warning", self.value)
+        return Finding("encoder_scale", "warning", "wheels", {"value": self.value, "radius": self.radius})
 
 
 def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:

@@ -32,13 +32,13 @@ from pipeline.results import (
     BREVITY,
     SEARCH_CUT,
     EstimatedNumber,
-    Finding,
     Interval,
     Named,
     RunDiagnosis,
     Value,
 )
 from pipeline.run import MotionRun
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     from pipeline.core import Budget
@@ -155,32 +155,24 @@ def _overlaps(effect: Effect, model: Model) -> bool:
 
 
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a terrain change imitates the true effect.
-_LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
+_LEAST_DRIVING_S = {"measured": 48.0, "command": 90.0}
 
 
 def note_brevity(data: EstimationData, common: RunDiagnosis) -> list[Finding]:
     """A finding where the driving is too short for reliable identification."""
-    least, words = _LEAST_DRIVING_S[common.input]
+    least = _LEAST_DRIVING_S[common.input]
     driven = float(count_seconds(data.whole).sum())
     if driven >= least:
         return []
-    have = "the runs together have" if len(data.runs) > 1 else "the run has"
-    text = (
-        f"{have} {math.floor(driven)} s of driving: effects estimated from {words} need at least "
-        f"{least:.0f} s, with turns and speeds of both signs"
-    )
-    return [Finding(BREVITY, text, "diagnosis", "warning")]
+    values = {"runs": len(data.runs), "driven_s": driven, "least_s": least, "input": common.input}
+    return [Finding(BREVITY, "warning", "diagnosis", values)]
 
 
 def note_cut(budget: Budget) -> list[Finding]:
     """A finding where the budget stopped the search before it was complete."""
     if not budget.was_cut:
         return []
-    text = (
-        f"the search stopped after {budget.seconds:g} s of CPU time: this is the best model found, and "
-        f"not all alternatives were tried (--budget {2.0 * budget.seconds:g}s continues the search)"
-    )
-    return [Finding(SEARCH_CUT, text, "diagnosis", "warning")]
+    return [Finding(SEARCH_CUT, "warning", "diagnosis", {"budget_s": budget.seconds})]
 
 
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:

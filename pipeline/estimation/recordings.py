@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.results import Finding, read_findings
+from pipeline.results import read_finding_table
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     import polars as pl
@@ -36,7 +37,7 @@ class Recording:
     def list_findings(self) -> tuple[Finding, ...]:
         """Findings of the stages."""
         table = self.tables.get("findings")
-        return () if table is None else read_findings({"findings": table.to_dicts()})
+        return () if table is None else read_finding_table(table)
 
 
 def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:

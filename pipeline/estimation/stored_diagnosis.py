@@ -81,7 +81,8 @@ def add_model(
             predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
         except SlipError as error:
             # For example dead encoders: the input exists, but a model cannot be computed from it.
-            findings.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
+            values = {"input": name, "why": str(error)}
+            findings.append(Finding("model_not_followed", "warning", "model", values))
             parts.append(part)
             continue
         columns = [*predicted.T, slip_stage.find_residual_modulus(predicted, part, length=length)]

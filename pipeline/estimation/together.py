@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import SlipError, format_share
+from pipeline.core import SlipError
 from pipeline.estimation.conclude import refuse
 from pipeline.estimation.diagnosis import Diagnosis
-from pipeline.results import Finding, RunDiagnosis, find_refusal
+from pipeline.results import RunDiagnosis, find_refusal
 from pipeline.run import MotionRun, load_run
-from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
+from pipeline.stages import WRONG_RADIUS, Finding, find_gain_of, is_grip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -85,7 +85,7 @@ def judge_together(
 def _leave_out(
     recording: Recording, source: str, recordings: Sequence[Recording], error: SlipError
 ) -> RunDiagnosis:
-    finding = Finding(error.code, f"left out: {error.what}", "diagnosis", "warning")
+    finding = Finding(error.code, "warning", "diagnosis", {"kind": "left out", "error": error.what})
     refused = refuse(recording, source, recordings)
     return msgspec.structs.replace(refused, findings=(finding, *refused.findings))
 
@@ -96,19 +96,12 @@ def _excuse(recordings: Sequence[Recording], vehicle: Vehicle) -> Mapping[str, F
     for recording in recordings:
         claim = next((one for one in recording.list_findings() if one.id == WRONG_RADIUS), None)
         slip = recording.tables.get("slip")
-        if claim is not None and isinstance(claim.value, float):
+        if claim is not None and claim.value is not None:
             claimed[recording.name] = claim.value / vehicle.wheel_radius_m
         elif slip is not None and (gain := find_gain_of(slip)) is not None:
             gains.append(gain)
     return {
-        run: Finding(
-            "slippery_ground",
-            f"the vehicle covers {format_share(gain)} of the distance of its wheels: slippery ground and no "
-            "wrong wheel radius, by the other runs",
-            "wheels",
-            "info",
-            value=gain,
-        )
+        run: Finding("slippery_ground", "info", "wheels", {"value": gain})
         for run, gain in claimed.items()
         if is_grip(gain, gains)
     }

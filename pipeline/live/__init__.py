@@ -30,7 +30,7 @@ from pipeline.results import (
     read_findings,
     read_result,
 )
-from pipeline.words import describe_need, describe_separation, suggest_drive
+from pipeline.words import describe_need, describe_separation, format_finding, suggest_drive
 
 RUNNING_T = 2.0 * LEAST_T
 """Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make bench NAME=watch` counts
@@ -161,17 +161,20 @@ def summarize(answer: dict[str, Any], diagnosis: RunDiagnosis, before: Sequence[
     asks += [part for name in diagnosis.unobservable_why for part in suggest_drive(name).split("; ")]
     asks = [*list(dict.fromkeys(asks))[:_MOST_ASKS], describe_need(diagnosis)]
     events = [one for one in findings if one.t_start is not None]
-    reasons = [one.text for one in diagnosis.findings if one.where == "diagnosis"]
-    refusal = find_refusal(findings) or ("" if ladder else "; ".join(reasons[:1]))
+    reasons = [one for one in diagnosis.findings if one.where == "diagnosis"]
+    refusal = find_refusal(findings) or (None if ladder else next(iter(reasons), None))
     return {
         "t_s": answer.get("log", {}).get("duration_s", 0.0),
         "slip": {name: one["median_modulus"] for name, one in answer.get("by_input", {}).items()},
         "error": pick_finite(ladder[-1], "t_mrmse_m", "r_mrmse_rad") if ladder else None,
         "known": known,
         "drive_next": [] if is_enough else list(filter(None, asks)),
-        "events": [pick(one, "id", "text", "t_start", "t_end") for one in events[-_MOST_EVENTS:]],
+        "events": [
+            {**pick(one, "id", "t_start", "t_end"), "text": format_finding(one)}
+            for one in events[-_MOST_EVENTS:]
+        ],
         "enough": is_enough,
-        "problem": answer.get("problem") or refusal,
+        "problem": answer.get("problem") or (format_finding(refusal) if refusal else ""),
     }
 
 

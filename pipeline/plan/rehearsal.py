@@ -30,6 +30,7 @@ from pipeline.plan.manoeuvres import Commands, PlanError, is_steered
 from pipeline.results import RunDiagnosis, find_refusal
 from pipeline.run import Alignment, DriveSeries, MotionRun, Track
 from pipeline.sources import Vehicle
+from pipeline.words import format_finding
 
 _POSE_HZ = 20.0
 # Poses and encoders continue for this time after the last command [s].
@@ -95,7 +96,8 @@ def study(
     joint = diagnose_runs(recordings, vehicle, notify=notify)
     diagnosis, where = joint.runs[0], recordings[0].name
     if joint.proposal is None:
-        why = find_refusal(diagnosis.findings) or "the log cannot be judged"
+        refusal = find_refusal(diagnosis.findings)
+        why = "the log cannot be judged" if refusal is None else format_finding(refusal)
         what = f"{why}, so that nothing can be planned from it"
         hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
         raise SlipError("nothing_judged", what, where=where, hint=hint)

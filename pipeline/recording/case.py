@@ -214,7 +214,8 @@ class Case:
     def correct(
         self,
         section: str,
-        what: str,
+        fault: str,
+        values: Mapping[str, object],
         line: str,
         change: dict[str, object],
         margin: float | None = None,
@@ -224,7 +225,8 @@ class Case:
 
         Args:
             section: of the configuration.
-            what: is wrong.
+            fault: what is wrong, a key of `pipeline.words.findings.FAULTS`.
+            values: of its template.
             line: of run.toml that corrects it.
             change: keys with their values.
             margin: Vuong's statistic of the correction.
@@ -239,20 +241,18 @@ class Case:
         name = "pose_turned" if section == "pose" else f"{section}_corrected"
         if "up" in change and not given and self.configuration.pose.axes != default.axes:
             given = ["axes"]
+        wrong = {**values, "kind": "configured", "fault": fault, "given": given, "value": margin}
         if given and section == "pose":
-            text = f"{what}, but [pose] in run.toml gives {', '.join(given)}, which is taken as it is given"
-            self.findings.append(Finding("pose_contradicted", "warning", text, where=section, value=margin))
+            self.findings.append(Finding("pose_contradicted", "warning", section, wrong))
             return
         if given:
-            text = f"{what}, but [{section}] in run.toml gives {', '.join(given)}: correct it"
-            self.findings.append(Finding("signs_contradict", "error", text, where=section))
+            self.findings.append(Finding("signs_contradict", "error", section, wrong))
             return
         self.changes.setdefault(section, {}).update(change)
         as_recorded = {**_AS_RECORDED[section]} | ({"unit": f'unit = "{usual}"'} if usual else {})
         settled = [text for key, text in as_recorded.items() if key in change]
-        otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
-        text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
-        self.findings.append(Finding(name, "warning", text, where=section, value=margin))
+        wrong |= {"kind": "corrected", "line": line, "otherwise": settled}
+        self.findings.append(Finding(name, "warning", section, wrong))
 
     def complete(self) -> Configuration:
         """The user's configuration with the corrections."""

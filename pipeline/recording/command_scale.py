@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, SlipError, fit_robustly, robust_spread
+from pipeline.core import Flags, Floats, SlipError, fit_robustly, pick, robust_spread
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import FEWEST_STEPS
@@ -67,24 +67,15 @@ def measure_command_scale(
         return neutral, ()
     used = vehicle.controller_track_multiplier
     multiplier = turning / forward * used
-    track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
-    text = (
-        f"in turns the difference of the wheels is {turning / forward:.2f} times the one commanded "
-        f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
-    )
-    finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
+    values = {"value": multiplier, "turns": turning / forward, "used": used}
+    finding = Finding("controller_multiplier", "warning", "command", values)
     return replace(neutral, track_multiplier=multiplier), (finding,)
 
 
 def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
     """Wheels that turn at another speed than commanded where the body does as it is told."""
-    radius = vehicle.wheel_radius_m
-    text = (
-        f"in slow driving the wheels turn {forward:.2f} times as fast as commanded, and the body moves as "
-        f"commanded: their readings are {forward:.2f} times too large (scale = {1.0 / forward:.3g} under "
-        f"[wheels] in run.toml), or their radius is {radius / forward:.3g} m and not {radius:.3g} m"
-    )
-    return Finding("wheels_scaled", "warning", text, where="wheels", value=forward)
+    values = {"value": forward, "radius_m": vehicle.wheel_radius_m}
+    return Finding("wheels_scaled", "warning", "wheels", values)
 
 
 def _explain_scale(
@@ -93,22 +84,15 @@ def _explain_scale(
     """One factor on the whole command, or the geometry of another vehicle where that contradicts turns."""
     forward, turning = ratios
     scales, other = (forward, forward), None
-    seen = f"in slow driving the wheels turn {forward:.2f} times as fast as commanded"
+    values: dict[str, object] = {"kind": "of the wheels", "forward": forward}
     if turning <= 0.0 or abs(np.log(turning / forward)) >= _SCALED:
-        seen += f", in turns their difference is {turning:.2f} times the commanded one (median)"
+        values["turning"] = turning
         if not body_commanded and turning > 0.0:
             scales, other = _find_geometry(scales, turning, vehicle)
-        if other is None:
-            seen += ": no single scale fits, and slip from commands in turns depends on it"
-    if other is None:
-        cause = "in another scale (another vehicle's wheel radius, a unit, or a gain of the drive)"
-        done = f"commands are multiplied by {forward:.2f}"
-    else:
-        sizes = f"wheel radius {other.wheel_radius_m:g} m, track {other.track_width_m:g} m"
-        cause = f"that of another vehicle ({other.name}: {sizes})"
-        done = f"corrected (mean of the sides times {scales[0]:.2f}, their difference times {scales[1]:.2f})"
-    text = f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
-    finding = Finding("command_scale", "warning", text, where="command", value=scales[0])
+    if other is not None:
+        values["vehicle"] = pick(other, "name", "wheel_radius_m", "track_width_m")
+    values |= {"value": scales[0], "turn_scale": scales[1]}
+    finding = Finding("command_scale", "warning", "command", values)
     return replace(neutral, command_scale=scales[0], command_turn_scale=scales[1]), (finding,)
 
 
@@ -218,12 +202,8 @@ def _take_as_followed(case: Case, command: Candidate, alignment: Alignment) -> A
     scales = [abs(float(one.gains[0])) / of for one, of in zip(fits, case.command_factors(), strict=True)]
     seen = [command.sign("ahead") != 0, command.sign("turned") != 0]
     ahead, turn = (scale if known else 1.0 for scale, known in zip(scales, seen, strict=True))
-    text = (
-        f"the numbers of {command.source} have no sure unit: as they are read, they are multiplied by "
-        f"{ahead:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
-        "of the drive and the ground are not known from them"
-    )
-    case.findings.append(Finding("command_scale", "warning", text, where="command", value=ahead))
+    values = {"kind": "without a unit", "value": ahead, "turn": turn, "source": str(command.source)}
+    case.findings.append(Finding("command_scale", "warning", "command", values))
     return replace(alignment, command_scale=ahead, command_turn_scale=turn)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core import Floats, enumerate_texts
+from pipeline.core import Floats
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, fit, measure_share
 from pipeline.recording.outages import leave_out
@@ -151,23 +151,18 @@ def resolve_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
     factors, idle = find_odd_joints(turning, sides)
     factors = {joint: float(f"{factor:.4g}") for joint, factor in factors.items()}
     for joint, factor in factors.items():
-        how = "counts backward" if factor < 0.0 else "counts"
-        if abs(factor) != 1.0:
-            how += f" {1.0 / abs(factor):.3g} times as fast as"
-        else:
-            how += " against"
-        what = f"{joint} of {wheels.source} {how} the other wheels"
+        values = {"joint": joint, "source": str(wheels.source), "factor": factor}
         line = ", ".join(f'"{name}" = {value:g}' for name, value in factors.items())
-        case.correct("wheels", what, f"factors = {{{line}}}", {"factors": factors})
+        case.correct("wheels", "joint", values, f"factors = {{{line}}}", {"factors": factors})
     for side, joints in chosen.items():
         left = [joint for joint in joints if joint not in idle]
         if left == joints or case.moves_sideways:
             continue
-        lost = enumerate_texts([joint for joint in joints if joint in idle])
+        lost = [joint for joint in joints if joint in idle]
         named = ", ".join(f'"{joint}"' for joint in left)
         line = f"{side} = [{named}]"
-        what = f"the drive does not turn {lost} of {wheels.source}, as it does the other wheels of its side"
-        case.correct("wheels", what, line, {side: left})
+        about = {"joints": lost, "source": str(wheels.source)}
+        case.correct("wheels", "idle joints", about, line, {side: left})
     return bool(factors or idle)
 
 
@@ -190,11 +185,9 @@ def resolve_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
         high, low = (abs(np.log(counts[one] * case.vehicle.wheel_radius_m)) for one in (side, other))
         side, other = (other, side) if low - high > 0.5 * abs(np.log(scale)) else (side, other)
     factor = float(f"{1.0 / snap(counts[side] / counts[other]):.4g}")
-    what = (
-        f"the {side} wheels' encoder counts {1.0 / factor:.3g} times as much as the {other} one for "
-        "the same motion (another gear or resolution?)"
-    )
-    case.correct("wheels", what, f"factors = {{{side} = {factor:g}}}", {"factors": {side: factor}})
+    values = {"side": side, "other": other, "factor": factor}
+    line = f"factors = {{{side} = {factor:g}}}"
+    case.correct("wheels", "side scale", values, line, {"factors": {side: factor}})
     return True
 
 
@@ -233,7 +226,8 @@ def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels:
         margin = wheels.reading.explained.sign_margin
         case.correct(
             "wheels",
-            f"the {side} wheels' encoder counts backward",
+            "side backward",
+            {"side": side},
             f'reversed = "{side}"',
             {"reversed": side},
             margin,
@@ -248,38 +242,24 @@ def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels:
             else explained.ahead.gains[0] > 0
         )
         side = "right" if is_right else "left"
-        also = (
-            "and its encoder with it"
-            if of_wheels
-            else "and its encoder counts what it does"
-            if wheels is not None
-            else "as far as commands and poses tell"
-        )
-        text = (
-            f"the {side} side of the drive runs backward against its command, {also}: the polarity of "
-            "its motor is wrong; exchange its wires, or turn its sign in the driver"
-        )
-        case.findings.append(
-            Finding("motor_reversed", "error", text, where="command", value=explained.sign_margin)
-        )
+        also = "encoder too" if of_wheels else "encoder right" if wheels is not None else "no encoder"
+        values = {"value": explained.sign_margin, "side": side, "kind": also}
+        case.findings.append(Finding("motor_reversed", "error", "command", values))
         return True
     return False
 
 
-def report_dead(case: Case, wheels: Candidate, without: str = "") -> bool:
+def report_dead(case: Case, wheels: Candidate, *, has_pose: bool = True) -> bool:
     """A side whose encoder is dead; whether one is.
 
     Args:
         case: the log.
         wheels: their candidate, a speed a side.
-        without: what is missed without it; by default the log is analyzed from commands.
+        has_pose: whether the log holds a pose, so that it can be analyzed from commands.
     """
     dead = wheels.reading.dead_side
     if not dead:
         return False
-    other = next(side for side in SIDES if side != dead)
-    rest = without or f"take --input command, or correct [wheels] {dead}"
-    text = f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: "
-    text += f"it is dead ({rest})"
-    case.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
+    values = {"side": dead, "other": next(side for side in SIDES if side != dead), "has_pose": has_pose}
+    case.findings.append(Finding("wheel_dead", "error", f"wheels {dead}", values))
     return True

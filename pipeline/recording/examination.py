@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.core import SlipError, enumerate_texts
+from pipeline.core import SlipError
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.encoders import report_dead, resolve_wheels
@@ -235,13 +235,7 @@ def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
 
 
 def _report_ground(wheels: DriveSource) -> Finding:
-    text = (
-        f"the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so that the "
-        "drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
-        "ground does is not observable, and slip in these results is the difference between "
-        "commanded and measured wheels"
-    )
-    return Finding(GROUND_UNOBSERVABLE, "warning", text, where="pose")
+    return Finding(GROUND_UNOBSERVABLE, "warning", "pose", {"wheels": str(wheels)})
 
 
 def _stand_in(case: Case) -> Recording | None:
@@ -266,7 +260,7 @@ def _stand_in(case: Case) -> Recording | None:
     resolve_losses(case, command)
     resolve_timeout(case, command, wheels, motion)
     if wheels.reading.form == "sides":
-        report_dead(case, wheels, "the log holds no pose in its rank")
+        report_dead(case, wheels, has_pose=False)
         _find_unit(case, wheels, command)
     if not case.findings or case.findings[-1].severity != "error":
         _report_opposite(case, command, wheels)
@@ -321,29 +315,31 @@ def _report_opposite(case: Case, command: Candidate, wheels: Candidate) -> None:
     explained = command.reading.explained
     if explained is None or not command.is_sure:
         return
+    verbs = list[str]()
     if is_crossed(command):
-        what = "one side of the wheels runs backward against its command"
-        mend = 'reversed = "left" or "right" under [wheels] in run.toml'
+        change = 'reversed = "left" or "right"'
         margin: float | None = explained.sign_margin
     else:
-        against = [
+        verbs = [
             verb
             for verb, sign in (("drive", command.sign("ahead")), ("turn", command.sign("turned")))
             if sign < 0
         ]
-        if not against:
+        if not verbs:
             return
-        what = f"the wheels {enumerate_texts(against)} the other way than {command.source} commands"
         changes = {"drive": "sign = -1 and exchanged = true", "turn": "exchanged = true"}
-        change = changes[against[0]] if len(against) == 1 else "sign = -1"
+        change = changes[verbs[0]] if len(verbs) == 1 else "sign = -1"
         if wheels.reading.form != "sides":
             change = "sign = -1"
-        mend, margin = f"{change} under [wheels] in run.toml", explained.moves
-    text = (
-        f"{what}, and no third signal shows which of them is wrong: either the encoders ({mend}), or the "
-        "command or the polarity of the motors, which are to be corrected on the robot"
-    )
-    case.findings.append(Finding("signs_contradict", "error", text, where="command, wheels", value=margin))
+        margin = explained.moves
+    values = {
+        "kind": "command and wheels",
+        "verbs": verbs,
+        "source": str(command.source),
+        "change": change,
+        "value": margin,
+    }
+    case.findings.append(Finding("signs_contradict", "error", "command, wheels", values))
 
 
 def _find_unit(case: Case, wheels: Candidate, command: Candidate) -> None:

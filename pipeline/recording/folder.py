@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.core import SlipError, enumerate_texts
+from pipeline.core import SlipError
 from pipeline.logs import (
     LogIndex,
     RaggedStrings,
@@ -54,19 +54,12 @@ def find_in_folder(index: LogIndex) -> tuple[Recognized | None, tuple[Finding, .
             named.setdefault(vehicle.id, (vehicle, []))[1].append(path.name)
     if not named:
         return None, ()
-    lost = "the end of the recording is lost, and it does not name its vehicle"
     if len(named) > 1:
-        names = enumerate_texts([vehicle.name for vehicle, _ in named.values()])
-        text = f"{lost}; recordings of its folder with the same topics name several ({names}): none is taken"
-        return None, (Finding("vehicle_of_folder", "warning", text, where="vehicle"),)
+        several = {"kind": "several", "vehicles": [vehicle.name for vehicle, _ in named.values()]}
+        return None, (Finding("vehicle_of_folder", "warning", "vehicle", several),)
     ((vehicle, logs),) = named.values()
-    who = logs[0] if len(logs) == 1 else f"{logs[0]} and {len(logs) - 1} more"
-    are = "is" if len(logs) == 1 else "are"
-    text = (
-        f"{lost}: it is taken to be a {vehicle.name}, as {who} of its folder with the same topics {are}; "
-        f'another: --vehicle, or in run.toml: [vehicle] preset = "{vehicle.id}"'
-    )
-    return Recognized(vehicle, "folder"), (Finding("vehicle_of_folder", "warning", text, where="vehicle"),)
+    values = {"kind": "one", "vehicle": vehicle.name, "preset": vehicle.id, "logs": logs}
+    return Recognized(vehicle, "folder"), (Finding("vehicle_of_folder", "warning", "vehicle", values),)
 
 
 def _list_beside(path: Path) -> list[Path]:

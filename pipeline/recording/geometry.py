@@ -6,10 +6,11 @@ a guess: its interval is by how it differs between blocks of the drive, not by t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
-from pipeline.core import NORMAL_95, format_share, join_parts
+from pipeline.core import NORMAL_95, join_parts
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Fit, Motion, Steps
@@ -211,8 +212,8 @@ def describe_vehicle(
     given: Sequence[str],
     *,
     is_body: bool,
-) -> tuple[str, str]:
-    """An id that depends only on the geometry of an unidentified vehicle, and a sentence on it.
+) -> tuple[str, dict[str, object]]:
+    """An id that depends only on the geometry of an unidentified vehicle, and the values of a finding on it.
 
     Args:
         seen: lengths by the signals.
@@ -222,52 +223,47 @@ def describe_vehicle(
         is_body: whether commands and measurements are body motion alone.
     """
     if is_body and kind != "ackermann":
-        text = (
-            "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
-            "whose slip does not depend on wheel radius and track width"
-        )
+        described: dict[str, object] = {"kind": "body alone", "is_omni": kind == "omni"}
         track = values.get("track_width_m")
         if kind == "differential" and track is not None:
-            text += f"; a difference of the wheels is that at a track of {track:g} m (--track-width: another)"
-        if kind == "omni":
-            text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
-        return "fitted_body", text
+            described["track_m"] = track
+        return "fitted_body", described
     lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
     words, shown = _list_shown(seen, kind, lengths)
-    parts = {
-        key: f"a{'n' * words[key].startswith('e')} {words[key]} of {one.value:.3g} m"
-        for key, one in shown.items()
-    }
-    fitted = [key for key in parts if key not in given]
-    own = " and ".join(text for key, text in parts.items() if key in given)
-    if not fitted:
-        text = f"the vehicle has {own}, as given or recorded"
-    else:
-        text = "the log does not identify the vehicle" + (f": {own} as given or recorded" if own else "")
     by_controller = {"wheel_radius_m": seen.radius, "track_width_m": seen.track}
-    commanded = [parts[key] for key in fitted if by_controller.get(key) is not None]
-    moved = [parts[key] for key in fitted if by_controller.get(key) is None]
-    if commanded:
-        listed = " and ".join(commanded)
-        verb = "are" if " and " in listed else "is"
-        text += f"; its controller turns commands into wheel speeds by {listed}, which {verb} used"
-    if moved:
-        verb = "fit" if len(moved) > 1 else "fits"
-        text += f"; {' and '.join(moved)} {verb} the motion, so that no effect is reported of it"
-    if kind == "differential" and "track_width_m" not in lengths:
-        text += "; there is too little turning for a track, or it is too uneven: give --track-width"
-    if fitted:
-        options = " or --wheel-radius and --track-width" if kind == "differential" else ""
-        ranges = ", ".join(f"{words[key]} {shown[key].format_range()}" for key in fitted)
-        text += (
-            f"; it is a guess (95 % of ten-second blocks of the drive: {ranges}), and slip from wheel "
-            f"encoders is as uncertain: [vehicle] in run.toml, as slip inspect shows it,{options} corrects it"
-        )
+    described = {
+        "kind": "lengths",
+        "vehicle_kind": kind,
+        "has_track": "track_width_m" in lengths,
+        "lengths": [
+            {
+                "name": words[key],
+                "value": one.value,
+                "low": one.interval[0],
+                "high": one.interval[1],
+                "by": "given"
+                if key in given
+                else "controller"
+                if by_controller.get(key) is not None
+                else "motion",
+            }
+            for key, one in shown.items()
+        ],
+        "alike": {},
+    }
     if kind == "ackermann":
-        return f"fitted_{1e3 * lengths['wheelbase_m']:.0f}", text
+        return f"fitted_{1e3 * lengths['wheelbase_m']:.0f}", described
     is_shown = kind != "mecanum" and not seen.is_taken
-    name, guess = _guess_platform(lengths["wheel_radius_m"], lengths.get("track_width_m"), is_shown=is_shown)
-    return f"fitted_{name}", f"{text} ({guess})" if guess else text
+    track_m = lengths.get("track_width_m")
+    radius_m = lengths["wheel_radius_m"]
+    name = f"{1e3 * radius_m:.0f}_{0.0 if track_m is None else 1e3 * track_m:.0f}"
+    alike = find_alike(radius_m, track_m) if is_shown and track_m is not None else {}
+    for first, (_, share) in islice(alike.items(), 1):
+        is_same = abs(share - 1.0) < _SAME_TRACK
+        name = first if is_same else name
+        described |= {"has_track_of_alike": is_same, "turns": share}
+        described["alike"] = {one: called for one, (called, _) in alike.items()}
+    return f"fitted_{name}", described
 
 
 def _list_shown(
@@ -295,20 +291,6 @@ def _list_shown(
         one, other = shown["track_width_m"], shown.pop("wheelbase_m")
         shown["track_width_m"] = Length(one.value + other.value, one.error + other.error)
     return words, shown
-
-
-def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tuple[str, str]:
-    """Id of the platform with these lengths [m], or digits of them; and what to confirm, if anything."""
-    name = f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
-    alike = find_alike(radius, track) if is_shown and track is not None else {}
-    if not alike:
-        return name, ""
-    first, (called, share) = next(iter(alike.items()))
-    if abs(share - 1.0) < _SAME_TRACK:
-        return first, f"{called} has about these: confirm with --vehicle {first}"
-    names = " or ".join(called for called, _ in alike.values())
-    turns = f"turns at {format_share(share)} of the ideal rate"
-    return name, f"{names} has such wheels, and then {turns}: confirm with --vehicle {' or '.join(alike)}"
 
 
 def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | None) -> Geometry:

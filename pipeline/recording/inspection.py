@@ -19,7 +19,7 @@ from pipeline.sources import (
     choose_sources,
     load_configuration,
 )
-from pipeline.stages import describe_pauses, find_pauses
+from pipeline.stages import Finding, find_pauses
 
 _GAP_PERIODS = 3.0
 
@@ -62,7 +62,7 @@ class Inspection:
     index: LogIndex
     topics: tuple[TopicHealth, ...]
     losses: tuple[Loss, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
     choice: Choice | None
     problem: SlipError | None
     unchecked: str = ""
@@ -106,17 +106,17 @@ def inspect_log(path: Path, options: LogOptions) -> Inspection:
         for channel in index.channels
     )
     choice, problem = _choose(index, configuration, options)
-    pauses = find_pauses(log_time for log_time, _ in times.values())
-    notes = (
-        *data.notes,
-        *([describe_pauses(pauses)] if pauses else []),
-        *(
-            f"{count} messages of {topic} are byte-for-byte copies of others: duplicates are ignored"
-            for topic, count in data.repeated.items()
-        ),
-    )
-    duration_s = index.duration_s - sum(after - last for last, after in pauses) / 1e9
-    return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked, duration_s)
+    lengths_ns = [after - last for last, after in find_pauses(log for log, _ in times.values())]
+    notes = [Finding("log_note", "info", "log", {"note": note}) for note in data.notes]
+    if lengths_ns:
+        values = {"kind": "pause", "value": max(lengths_ns) / 1e9, "count": len(lengths_ns)}
+        notes.append(Finding("clock_jump", "warning", "recorder", values))
+    notes += [
+        Finding("repeated_messages", "warning", topic, {"kind": "ignored", "count": count})
+        for topic, count in data.repeated.items()
+    ]
+    duration_s = index.duration_s - sum(lengths_ns) / 1e9
+    return Inspection(index, topics, data.losses, tuple(notes), choice, problem, data.unchecked, duration_s)
 
 
 def _measure_topic(

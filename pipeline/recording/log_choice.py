@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import NORMAL_95, format_share, name_first, return_freed_memory
+from pipeline.core import NORMAL_95, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -64,7 +64,7 @@ from pipeline.sources import (
     recognize_vehicle,
     resolve_vehicle,
 )
-from pipeline.stages import Finding, Given, find_sideways_share, list_wanted, with_texts
+from pipeline.stages import Finding, Given, Severity, find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
@@ -258,8 +258,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
             is_wanted = topic in named or len(findings) == _MOST_UNFIT
             if error.code != "field_not_found" or topic is None or is_wanted:
                 raise
-            text = f"{topic} is left out: {error.what}"
-            findings.append(Finding("topic_left_out", "warning", text, where=topic))
+            findings.append(Finding("topic_left_out", "warning", topic, {"why": error.what}))
             index = replace(index, channels=tuple(one for one in index.channels if one.topic != topic))
         else:
             return replace(chosen, findings=(*findings, *chosen.findings))
@@ -295,15 +294,14 @@ def _choose_readable(
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
     findings += beside
     findings += [
-        Finding("vehicle_choice", "info", note, where="vehicle")
+        Finding("vehicle_choice", "info", "vehicle", note)
         for note in (recognized.notes if recognized else ())
     ]
     recorded = find_preset(index.deployment.get("vehicle") or "")
     witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
     findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
     if sources.command is None and sources.wheels is not None and sources.pose is not None:
-        text = "the log contains no commands: it is analyzed from wheel encoders"
-        findings.append(Finding("no_command", "info", text, where="command"))
+        findings.append(Finding("no_command", "info", "command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     chosen = _choose_pose(chosen, channels, index, configuration)
     # The content may leave no drive: what was chosen by name is a drive all the same.
@@ -386,8 +384,8 @@ def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[lis
         messages[channel.topic] += channel.message_count or 0
     fullest = set(sorted(rivals, key=lambda rival: -messages[rival.topic])[: MOST_POSES - 1])
     count = len(rivals) + 1
-    text = f"{count} topics or frames hold poses: the {MOST_POSES} with most messages were compared"
-    finding = Finding("poses_left_out", "warning", text, where="pose", count=count - MOST_POSES)
+    values = {"count": count - MOST_POSES, "all": count, "compared": MOST_POSES}
+    finding = Finding("poses_left_out", "warning", "pose", values)
     return [rival for rival in rivals if rival in fullest], finding
 
 
@@ -474,12 +472,10 @@ def _leave_out_silent(
         return channels, sources, []
     silent = list(dict.fromkeys(one.signals[0].topic for one in texts))
     silent = [topic for topic in silent if topic not in readable]
-    subject = "the topic was" if len(silent) == 1 else "the topics were"
-    text = f"no message of {name_first(silent)} is a readable command: {subject} left out"
     unread = set(silent)
     channels = [channel for channel in channels if channel.topic not in unread]
     sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
-    return channels, sources, [Finding("no_readable_text", "warning", text, where=silent[0])]
+    return channels, sources, [Finding("no_readable_text", "warning", silent[0], {"topics": silent})]
 
 
 def _is_text(index: LogIndex, command: DriveSource) -> bool:
@@ -510,19 +506,18 @@ def _list_contradictions(
     witnesses: Sequence[Recognized], vehicle: Vehicle, source: VehicleSource
 ) -> Iterator[Finding]:
     """Findings on a chosen vehicle that what the log shows, or says of itself, contradicts."""
-    named = f"{vehicle.name} was given: check --vehicle"
-    if source != "flag":
-        where = "run.toml or the log's metadata"
-        named = f"{where} states {vehicle.name}, which is used: check [vehicle] or --vehicle"
     for one in witnesses:
         differing = list_contradictions(one.vehicle, vehicle)
         is_given = source in {"flag", "configuration", "metadata"} and source != one.source
         if is_given and differing and one.vehicle.sideways_preset != vehicle.id:
-            text = (
-                f"the {one.source.replace('_', ' ')} of the log indicates a {one.vehicle.name} "
-                f"({', '.join(differing)}), but {named}"
-            )
-            yield Finding("vehicle_contradiction", "warning", text, where="vehicle")
+            values = {
+                "source": one.source,
+                "indicated": one.vehicle.name,
+                "differing": differing,
+                "vehicle": vehicle.name,
+                "is_flag": source == "flag",
+            }
+            yield Finding("vehicle_contradiction", "warning", "vehicle", values)
 
 
 def _compare(
@@ -540,12 +535,12 @@ def _compare(
     if rivals or _may_be_odometry(sources.pose):
         ratings = rate_poses(given)
         if ratings and ratings[0].same_as:
-            text = (
-                f"the pose of {ratings[0].source} is wheel odometry, not a localization: it is that of "
-                f"{ratings[0].same_as}, computed from the wheels, and says nothing about the ground; "
-                "record a localization (lidar, camera, satellites, motion capture)"
-            )
-            findings.append(Finding("pose_from_wheels", "error", text, where="pose"))
+            values = {
+                "kind": "is another",
+                "pose": str(ratings[0].source),
+                "same_as": str(ratings[0].same_as),
+            }
+            findings.append(Finding("pose_from_wheels", "error", "pose", values))
         useless = ratings[0].refusal if ratings and ratings[0].stands else ""
         if ratings and ratings[0].from_wheels and not ratings[0].same_as:
             useless = (
@@ -558,25 +553,19 @@ def _compare(
                 replace(chosen, sources=replace(sources, pose=None)), index, configuration
             )
             if alone.recording is not None:
-                text = f"not used: the poses of {ratings[0].source}: {useless}"
-                unused = Finding("numbers_not_used", "warning", text, where=ratings[0].source.topic)
+                what = f"the poses of {ratings[0].source}: {useless}"
+                unused = Finding("numbers_not_used", "warning", ratings[0].source.topic, {"what": what})
                 return replace(alone, findings=(*alone.findings, unused))
         if useless and ratings[0].from_wheels:
-            text = (
-                "the pose comes from the wheels, so forward slip is not observable: "
-                f"{ratings[0].source} is computed from them, and the log has no other pose"
-            )
-            findings.append(Finding("pose_from_wheels", "error", text, where=str(ratings[0].source)))
+            only = {"kind": "is the only one"}
+            findings.append(Finding("pose_from_wheels", "error", str(ratings[0].source), only))
     recording = examine(replace(given, sources=sources))
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
         made = examine(replace(given, sources=instead))
         if made.is_followed and (made.margin > recording.margin or not recording.is_followed):
-            text = (
-                f"{other.source} is taken for the pose, and not {ratings[0].source}: the vehicle moves as it "
-                "does; the other is of another body"
-            )
-            findings.append(Finding("pose_of_another", "info", text, where="pose"))
+            values = {"pose": str(other.source), "other": str(ratings[0].source)}
+            findings.append(Finding("pose_of_another", "info", "pose", values))
             ratings = (other, *(one for one in ratings if one is not other))
             recording = made
             break
@@ -649,8 +638,8 @@ def _fit_vehicle(
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
         why = _explain_left_out(recording, str(sources.wheels), contradiction)
-        text = f"not used: {sources.wheels}: {why}"
-        findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
+        about = {"wheels": str(sources.wheels), **why}
+        findings.append(Finding("wheels_left_out", "warning", "wheels", about))
         sources, is_body, kind = replace(sources, wheels=None), True, kind.replace("mecanum", "omni")
     if kind == "ackermann" and "wheelbase_m" not in values:
         if standing_in is not None:
@@ -660,7 +649,7 @@ def _fit_vehicle(
     if kind == "ackermann":
         assumed.pop("track_width_m", None)
     used: dict[str, object] = {**(assumed if is_body else {}), **values}
-    name, text = describe_vehicle(recording.geometry, kind, used, [*known], is_body=is_body)
+    name, described = describe_vehicle(recording.geometry, kind, used, [*known], is_body=is_body)
     bare = {"name": "fitted vehicle", "track_width_m": None, "wheelbase_m": None}
     vehicle = msgspec.structs.replace(
         chosen.vehicle,
@@ -669,7 +658,8 @@ def _fit_vehicle(
         errors={} if is_body else errors,
     )
     is_given = all(key in known for key in values) and not is_body
-    findings.append(Finding("vehicle_fitted", "info" if is_given else "warning", text, where="vehicle"))
+    severity: Severity = "info" if is_given else "warning"
+    findings.append(Finding("vehicle_fitted", severity, "vehicle", described))
     return replace(
         chosen,
         vehicle=vehicle,
@@ -679,29 +669,23 @@ def _fit_vehicle(
     )
 
 
-def _explain_left_out(recording: Recording, wheels: str, contradiction: str) -> str:
+def _explain_left_out(
+    recording: Recording, wheels: str, contradiction: Mapping[str, Sequence[float]]
+) -> dict[str, object]:
     """Why wheels are not used whose vehicle is not known."""
     if contradiction:
-        return f"{contradiction} (--wheel-radius and --track-width, or --vehicle, decide)"
+        return {"kind": "radius contradicted", **contradiction}
     read = {one.name for one in recording.evidence}
-    if read and wheels not in read:
-        return "no speeds of both sides are found in it (left and right under [wheels] name the joints)"
-    return (
-        "the vehicle is not known, and its motion does not show the radius of its wheels (--vehicle, or "
-        "--wheel-radius and --track-width, give it)"
-    )
+    return {"kind": "no sides" if read and wheels not in read else "radius unknown"}
 
 
-def _contradict_radius(seen: Geometry, known: Mapping[str, object]) -> str:
-    """By how much commands and poses show wheels of different radius, where nothing else tells it; or ""."""
+def _contradict_radius(seen: Geometry, known: Mapping[str, object]) -> dict[str, list[float]]:
+    """Wheel radii [m] by commands and poses that differ, with their 95 % intervals; empty without."""
     one, other = seen.radius, seen.rolled
     if "wheel_radius_m" in known or one is None or other is None or not seen.is_contradicted:
-        return ""
-    return (
-        f"by the commands the wheel radius is {one.value:.3g} m ({one.format_range()}), by the poses "
-        f"{other.value:.3g} m ({other.format_range()}), as if the wheels covered "
-        f"{format_share(other.value / one.value)} of the distance"
-    )
+        return {}
+    sizes = {"commanded_m": one, "rolled_m": other}
+    return {name: [length.value, *length.interval] for name, length in sizes.items()}
 
 
 def _take_unit_wheels(
@@ -723,13 +707,8 @@ def _take_unit_wheels(
     needed = (*_STAND_INS,) if kind == "differential" else ("wheel_radius_m", "wheelbase_m")
     lengths = {**_STAND_INS, "wheelbase_m": 1.0}
     assumed = {key: lengths[key] for key in needed if key not in values}
-    words = {"wheel_radius_m": "a wheel radius", "track_width_m": "a track", "wheelbase_m": "a wheelbase"}
-    taken = " and ".join(f"{words[key]} of {value:g} m" for key, value in assumed.items())
-    text = (
-        "no vehicle is given and none is needed: commands and measurements are of the same wheels; lengths "
-        f"in metres are for {taken} ([vehicle] {', '.join(assumed)} in run.toml: others)"
-    )
     bare = {"name": "fitted vehicle", "wheelbase_m": None, "id": "fitted_wheels", "kind": kind}
     vehicle = msgspec.structs.replace(chosen.vehicle, **{**bare, **assumed, **values}, stand_ins=[*assumed])
-    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
+    finding = Finding("vehicle_fitted", "warning", "vehicle", {"kind": "wheels alone", "assumed": assumed})
+    findings = (*chosen.findings, finding)
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)

@@ -91,12 +91,9 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
         left, right = sides.left, sides.right
         wheels = msgspec.structs.replace(configuration.wheels, left_topic=left, right_topic=right)
         configuration = msgspec.structs.replace(configuration, wheels=wheels)
-        text = (
-            f"{left} and {right}, of a type that is not known, are taken for the left and right wheels by "
-            "their names ([wheels] in run.toml names others)"
-        )
         taken = choose(index, configuration, options.overrides)
-        finding = Finding("sides_by_name", "warning", text, where=sides.topic)
+        values = {"left": left, "right": right}
+        finding = Finding("sides_by_name", "warning", sides.topic, values)
         chosen = replace(taken, findings=(*taken.findings, finding))
     chosen = report_unused(chosen, index)
     require_sources(chosen, index, options)
@@ -154,7 +151,9 @@ def require_sources(chosen: Choice, index: LogIndex, options: LogOptions) -> Non
         what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
         named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
         is_there = _may_be_named(index, "drive", "number", "numbers", "joints")
-        unused = [one.text for one in chosen.findings if one.id == "numbers_not_used"]
+        unused = [
+            f"not used: {one.values['what']}" for one in chosen.findings if one.id == "numbers_not_used"
+        ]
         named = ". ".join([*(unused or [_RECORD_DRIVE]), *([named] if is_there else [])])
         hint = f"{named[0].upper()}{named[1:]}. The log has: {there}."
         raise RecordingError("no_command", what, where=str(index.path), hint=hint)
@@ -302,13 +301,13 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
             continue
         role = "command" if COMMANDED.search(topic.lower()) else "wheels"
         left, right = (_quote(f"{topic}.{field}[{number}]") for number in range(len(SIDES)))
-        text = (
-            f"not used: {topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they "
+        what = (
+            f"{topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they "
             f"are {'the left and right wheels' if count == len(SIDES) else _SEVERAL}, in run.toml: [{role}] "
             f"left_topic = {left}; right_topic = {right}{_ANY_UNIT}"
         )
         severity: Severity = "info" if getattr(sources, role) else "warning"
-        findings.append(Finding("numbers_not_used", severity, text, where=topic))
+        findings.append(Finding("numbers_not_used", severity, topic, {"what": what}))
     return findings
 
 
@@ -361,12 +360,12 @@ def _find_only_sides(index: LogIndex, sources: Sources) -> _Sides | None:
 def _offer(sides: _Sides) -> Finding:
     """The line that takes numbers for a role."""
     unit = next((text for word, text in _UNITS.items() if re.search(word, sides.left.lower())), _ANY_UNIT)
-    text = (
-        f"not used: {sides.left} and {sides.right}, whose meaning is not known; if they are the left and "
+    what = (
+        f"{sides.left} and {sides.right}, whose meaning is not known; if they are the left and "
         f"right wheels, in run.toml: [{sides.role}] left_topic = {_quote(sides.left)}; "
         f"right_topic = {_quote(sides.right)}{unit}"
     )
-    return Finding("numbers_not_used", "warning", text, where=sides.topic)
+    return Finding("numbers_not_used", "warning", sides.topic, {"what": what})
 
 
 def _quote(name: str) -> str:
@@ -386,12 +385,12 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         if MEASURED.search(topic.lower()):
             continue
         if plain_type(index.types[topic]) == JOYSTICK:
-            text = (
-                f"not used: {topic} (a joystick); if two of its axes are the command, in run.toml: "
+            what = (
+                f"{topic} (a joystick); if two of its axes are the command, in run.toml: "
                 f"[command] speed_topic = {_quote(f'{topic}.axes[1]')}; "
                 f"yaw_rate_topic = {_quote(f'{topic}.axes[0]')} (which axes, the set-up of its driver says)"
             )
-            yield Finding("numbers_not_used", "warning", text, where=topic)
+            yield Finding("numbers_not_used", "warning", topic, {"what": what})
             continue
         ends = {path: path.rpartition(".")[2].lower() for path in paths}
         speeds = [path for path, end in ends.items() if _SPEED.search(end)]
@@ -400,8 +399,8 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         if speeds and turns:
             key, turn = turns[0]
             speed, turn = (_quote(f"{topic}.{path}") for path in (speeds[0], turn))
-            text = (
-                f"not used: {topic} (a speed and a turn), whose meaning is not known; if it is the command, "
+            what = (
+                f"{topic} (a speed and a turn), whose meaning is not known; if it is the command, "
                 f"in run.toml: [command] speed_topic = {speed}; {key} = {turn}"
             )
-            yield Finding("numbers_not_used", "warning", text, where=topic)
+            yield Finding("numbers_not_used", "warning", topic, {"what": what})

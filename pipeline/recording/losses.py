@@ -7,7 +7,7 @@ last one that is recorded.
 import msgspec
 import numpy as np
 
-from pipeline.core import NORMAL_95, Floats, format_share
+from pipeline.core import NORMAL_95, Floats
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.motion import compare
 from pipeline.recording.readings import Reading
@@ -40,11 +40,12 @@ def resolve_losses(case: Case, command: Candidate | None) -> None:
     made = reading.explained
     if not share or made is None:
         return
-    text = (
-        f"{format_share(share)} of the messages of {command.source} are missing: they come every "
-        f"{period:.2g} s, or after two, three or more times that, at random. They were lost, as over a "
-        "radio link or with QoS best effort"
-    )
+    values: dict[str, object] = {
+        "kind": "told",
+        "value": share,
+        "source": str(command.source),
+        "period_s": period,
+    }
     filled = None
     if not section.interpolate and section.hold_s is None:
         between = msgspec.structs.replace(section, interpolate=True)
@@ -57,18 +58,12 @@ def resolve_losses(case: Case, command: Candidate | None) -> None:
         case.changes.setdefault("command", {})["interpolate"] = True
         command.reading = filled
         filled.explain(made.motion)
-        text += (
-            ", but the base got them: those missing are taken to be between the ones around them, as "
-            "interpolate = true under [command] in run.toml does"
-        )
+        values["kind"] = "interpolated"
     elif gain < -NORMAL_95:
-        text += ", and the base did not get them: it follows the last one that is recorded"
+        values["kind"] = "held"
     elif not section.interpolate:
-        text += (
-            ". The last one is held, for no signal shows whether the base got them: if it did, a lag of the "
-            f"drive is up to {1e3 * period * share / (1.0 - share):.0f} ms longer than found"
-        )
-    case.findings.append(Finding("commands_lost", "warning", text, where="command", value=share))
+        values["kind"] = "undecided"
+    case.findings.append(Finding("commands_lost", "warning", "command", values))
 
 
 def find_losses(reading: Reading) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, Ints, enumerate_texts, find_scale, fit_robustly, list_likelihoods
+from pipeline.core import Flags, Floats, Ints, find_scale, fit_robustly, list_likelihoods
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.motion import STEP_S, Motion, Steps
 from pipeline.recording.readings import SIDES, Held, Reading
@@ -385,14 +385,6 @@ def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: 
     return made
 
 
-_READS = {
-    "nothing": "no reading is recorded",
-    "zero": "zero is recorded",
-    "one value": "one value is repeated",
-    "noise": "noise is recorded",
-}
-
-
 def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: Motion | None) -> bool:
     """Leave out where an encoder reads nothing while all else goes on; whether any is left out."""
     reading, section = wheels.reading, case.complete().wheels
@@ -411,13 +403,9 @@ def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: 
     table = case.extraction.read_drive(wheels.source, section, held=False)
     stamps = table["t"].to_numpy()
     clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
-    words = {
-        "the commands": asked,
-        "the poses": motion,
-        "the other wheels": asked is None or motion is None,
-    }
-    witnesses = [word for word, is_there in words.items() if is_there]
-    texts, spans = [], []
+    there = {"command": asked, "pose": motion, "other wheels": asked is None or motion is None}
+    witnesses = [name for name, is_there in there.items() if is_there]
+    stretches, spans = list[dict[str, object]](), []
     for one in outages:
         inside = (stamps >= one.start) & (stamps < one.end)
         columns = [name for name in (*SIDES, "speed") if one.side in {name, "both"}]
@@ -428,26 +416,21 @@ def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: 
         start, end = (
             at if np.isinf(at) else float(np.interp(at, stamps, clock)) for at in (one.start, one.end)
         )
-        when = f"from {start:.0f} to {end:.0f} s"
-        if end == np.inf:
-            when = f"from {start:.0f} s on"
-        elif start == -np.inf:
-            when = f"until {end:.0f} s"
-        who = "both wheels' encoders read" if one.side == "both" else f"the {one.side} wheels' encoder reads"
-        texts.append(f"{who} nothing {when} ({_READS[reads]} while {enumerate_texts(witnesses)} go on)")
+        known = {name: at for name, at in (("start_s", start), ("end_s", end)) if np.isfinite(at)}
+        stretches.append({"side": one.side, "reads": reads, **known})
         # In hundredths, which the line of the text has as well.
         first = None if np.isinf(start) else float(np.floor(1e2 * start) / 1e2)
         last = None if np.isinf(end) else float(np.ceil(1e2 * end) / 1e2)
         spans.append(OutageSection(side=one.side, start_s=first, end_s=last))  # type: ignore[arg-type]
     case.changes.setdefault("wheels", {})["ignore"] = spans
-    text = (
-        f"{'; '.join(texts)}: left out, as ignore = {write_spans(spans)} under [wheels] in run.toml "
-        "does; ignore = [] takes it as recorded"
-    )
+    values = {
+        "count": len(outages),
+        "stretches": stretches,
+        "witnesses": witnesses,
+        "line": f"ignore = {write_spans(spans)}",
+    }
     begin = None if np.isinf(outages[0].start) else outages[0].start
-    case.findings.append(
-        Finding("encoder_dead", "warning", text, where="wheels", t_start=begin, count=len(outages))
-    )
+    case.findings.append(Finding("encoder_dead", "warning", "wheels", values, t_start=begin))
     return True
 
 

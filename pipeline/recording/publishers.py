@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core import Floats, format_share
+from pipeline.core import Floats
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.outages import write_spans
 from pipeline.recording.readings import Reading
@@ -49,13 +49,14 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
     table = case.extraction.read_drive(command.source, case.complete().command, held=True)
     clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
     ends = [np.interp(span, table["t"].to_numpy(), clock).tolist() for span in spans]
-    when = f"from {ends[0][0]:.0f} to {ends[0][1]:.0f} s"
-    when += f" and in {len(ends) - 1} further stretches" if len(ends) > 1 else ""
-    text = (
-        f"two publishers send commands on {command.source} by turns {when} ({format_share(zeros)} of the "
-        "messages there are zero): which of them the drive obeys depends on when it reads; let one send at a "
-        "time (twist_mux does)"
-    )
+    values: dict[str, object] = {
+        "kind": "told",
+        "value": zeros,
+        "count": len(spans),
+        "source": str(command.source),
+        "start_s": ends[0][0],
+        "end_s": ends[0][1],
+    }
     is_rest_used = bool(np.mean(inside[live]) < _MOST)
     is_replaced = not is_rest_used and wheels is not None and wheels.is_sure
     if is_rest_used:
@@ -64,14 +65,13 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
             for start, end in ends
         ]
         case.changes.setdefault("command", {})["ignore"] = ignore
-        text += f": left out, as ignore = {write_spans(ignore)} under [command] in run.toml does"
-        text += "; ignore = [] takes them"
+        values |= {"kind": "left out", "line": f"ignore = {write_spans(ignore)}"}
     elif is_replaced:
-        text += f": {command.source} is not used, and the run is analyzed from its wheels"
+        values["kind"] = "replaced"
     is_usable = is_rest_used or is_replaced
     name = "command_mixed" if is_usable else "commands_mixed"
     severity: Literal["warning", "error"] = "warning" if is_usable else "error"
-    case.findings.append(Finding(name, severity, text, where="command", value=zeros, count=len(spans)))
+    case.findings.append(Finding(name, severity, "command", values))
     if is_replaced:
         case.leave_out(command.source)
         return None

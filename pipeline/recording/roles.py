@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core import Floats, enumerate_texts, format_duration
+from pipeline.core import Floats
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, compare, fit
@@ -70,8 +70,8 @@ def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
         if source.form is DriveForm.BODY and source.reason != CONFIGURED:
             reading = case.read(source, is_measured=True)
         if reading is not None and (why := _explain_of_ground(reading, motion)):
-            text = f"not used: {source}: {why}"
-            case.findings.append(Finding("numbers_not_used", "info", text, where=source.signals[0].topic))
+            what = {"what": f"{source}: {why}"}
+            case.findings.append(Finding("numbers_not_used", "info", source.signals[0].topic, what))
             case.leave_out(source)
     case.moves_sideways = given.may_move_sideways(case.sources)
 
@@ -120,13 +120,8 @@ def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading 
             sides["left" if made.gains[0] * made.gains[1] < 0.0 else "right"].append(name)
     if not (sides["left"] and sides["right"]):
         return None
-    names = {side: ", ".join(joined) for side, joined in sides.items()}
-    what = (
-        f"the joints of {source} do not name their side; by the motion {names['left']} are left and "
-        f"{names['right']} right"
-    )
     line = "; ".join(f"{side} = {json.dumps(names, ensure_ascii=False)}" for side, names in sides.items())
-    case.correct("wheels", what, line, dict(sides))
+    case.correct("wheels", "sides by motion", {"source": str(source), **sides}, line, dict(sides))
     section = case.complete().wheels
     return case.read(source, is_measured=True, section=section)
 
@@ -145,11 +140,7 @@ def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]
         if back < _BOTH_WAYS or not sides or any(side.values.min() < 0.0 for side in sides):
             signed.append(one)
             continue
-        text = (
-            f"not used: {one.source}: its speeds have no sign: they are never below zero, though the "
-            "body is driven forward and backward"
-        )
-        case.findings.append(Finding("wheels_unsigned", "warning", text, where="wheels"))
+        case.findings.append(Finding("wheels_unsigned", "warning", "wheels", {"wheels": str(one.source)}))
         case.leave_out(one.source)
     return signed
 
@@ -180,9 +171,8 @@ def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | N
                 _report_command(case, best, command)
             command = best
     if command is not None and _is_no_command(command):
-        text = f"not used: {command.source}: it measures the motion, which equals it at once"
-        where = command.source.signals[0].topic
-        case.findings.append(Finding("numbers_not_used", "info", text, where=where))
+        what = {"what": f"{command.source}: it measures the motion, which equals it at once"}
+        case.findings.append(Finding("numbers_not_used", "info", command.source.signals[0].topic, what))
         case.sources, command = replace(case.sources, command=None), None
     wheels = _find_wheels(case, drives, command)
     if wheels is not None and command is not None and wheels.source.signals == command.source.signals:
@@ -231,9 +221,12 @@ def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | N
     others = [one for one in drives if one.is_measured and one.is_sure and one not in (wheels, command)]
     if not others:
         return wheels
-    why = "no speeds of both sides are found in it" if wheels is None else "the motion does not follow it"
-    text = f"not used: {source}: {why}; {others[0].source} is taken for the wheels"
-    case.findings.append(Finding("wheels_left_out", "info", text, where="wheels"))
+    values = {
+        "kind": "sides not found" if wheels is None else "not followed",
+        "wheels": str(source),
+        "taken": str(others[0].source),
+    }
+    case.findings.append(Finding("wheels_left_out", "info", "wheels", values))
     return others[0]
 
 
@@ -271,12 +264,8 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
     if first is None or any(one.is_sure for one in drives):
         return
     if case.extraction.data.losses and first.source.reason != CONFIGURED:
-        text = (
-            "a part of the log is lost, and what is left does not show that the poses of "
-            f"{case.sources.pose} move as {first.source} commands ([command] topic in run.toml takes it all "
-            "the same)"
-        )
-        case.findings.append(Finding("not_driven", "error", text, where="pose"))
+        values = {"kind": "log damaged", "pose": str(case.sources.pose), "command": str(first.source)}
+        case.findings.append(Finding("not_driven", "error", "pose", values))
         return
     if made is None or first.reading.form != "body":
         return
@@ -289,11 +278,13 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
     is_unlike = max(made.shares) < _UNLIKE and made.blocks.size >= _FEWEST_BLOCKS
     if not is_unlike or moved < _GOES * expected:
         return
-    text = (
-        f"the poses of {case.sources.pose} move {moved:.3g} m, but not as {first.source} commands: they are "
-        "of another body, or something else drives it ([pose] and [command] in run.toml name others)"
-    )
-    case.findings.append(Finding("not_driven", "error", text, where="pose", value=moved))
+    about: dict[str, object] = {
+        "kind": "another body",
+        "value": moved,
+        "pose": str(case.sources.pose),
+        "command": str(first.source),
+    }
+    case.findings.append(Finding("not_driven", "error", "pose", about))
 
 
 def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
@@ -301,22 +292,16 @@ def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate 
 
 
 def _report_command(case: Case, chosen: Candidate, other: Candidate) -> None:
-    text = (
-        f"{chosen.source} is taken for the command, and not {other.source}: the motion follows the first "
-        "later, and the second measures it or is not followed; [command] in run.toml names another"
-    )
-    case.findings.append(Finding("role_by_motion", "info", text, where="command"))
+    values = {"command": str(chosen.source), "other": str(other.source)}
+    case.findings.append(Finding("role_by_motion", "info", "command", values))
 
 
 def resolve_stamps(case: Case, command: Candidate | None) -> None:
     """Take the times of recording of a command that is stamped after it was recorded."""
     if case.ahead is None or command is None or command.source.signals != case.ahead[0].signals:
         return
-    what = (
-        f"the stamps of {command.source} lie {format_duration(case.ahead[1])} after they were recorded, "
-        "and those of the other topics do not: its clock runs ahead"
-    )
-    case.correct("command", what, 'time = "log"', {"time": "log"})
+    values = {"source": str(command.source), "ahead_s": case.ahead[1]}
+    case.correct("command", "clock ahead", values, 'time = "log"', {"time": "log"})
 
 
 def name_sources(case: Case, command: Candidate | None, wheels: Candidate | None) -> Sources:
@@ -367,13 +352,8 @@ def leave_out_steered(case: Case, wheels: Candidate) -> bool:
     steered = list_steered(case.extraction.columns[wheels.source.signals[0].topic])
     if not steered:
         return False
-    text = (
-        f"not used: {wheels.source}: {enumerate_texts(steered)} steer, so this is not a differential "
-        "drive, and it does not turn as a car that steers by the middle of them (several axles steer, or "
-        "each wheel by itself); steering_joint and left and right under [wheels] and "
-        '[vehicle] kind = "ackermann" in run.toml take it for a car'
-    )
-    case.findings.append(Finding("wheels_steered", "warning", text, where="wheels"))
+    values = {"wheels": str(wheels.source), "joints": list(steered)}
+    case.findings.append(Finding("wheels_steered", "warning", "wheels", values))
     case.sources = replace(case.sources, wheels=None)
     return True
 
@@ -422,9 +402,10 @@ def report_turn(case: Case, command: Candidate | None) -> None:
     if command is None or not command.is_angle:
         return
     speed, turn = command.source.signals
-    text = (
-        f"{command.source} holds steering angles in place of yaw rates: the vehicle turns by the speed "
-        f'times their tangent: read so, as speed_topic = "{speed}" and steering_topic = "{turn}" under '
-        "[command] in run.toml do"
-    )
-    case.findings.append(Finding("command_corrected", "warning", text, where="command"))
+    values = {
+        "kind": "steering angles",
+        "source": str(command.source),
+        "speed": str(speed),
+        "turn": str(turn),
+    }
+    case.findings.append(Finding("command_corrected", "warning", "command", values))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core import enumerate_texts, format_length
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
 from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare, fit
@@ -14,33 +13,10 @@ from pipeline.sources import PoseContent
 from pipeline.stages import Finding
 
 _HALF_TURN = 180.0
-_AGREE = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}
-_AGAINST = {"command": "the commands", "wheels": "the measured wheels", "gyro": "the gyro"}
-_FAULTS = {
-    "pose_backward": "the frame of the poses points to the rear, as that of a sensor that is mounted "
-    "backward",
-    "pose_mirrored": "the poses' frame is of the other hand, as north, east, down",
-    "command_ahead": "the sign of linear.x is wrong where it is sent, or both motors are reversed",
-    "command_turned": "the sign of angular.z or of the steering is inverted, or left and right are exchanged",
-    "command_aside": "the sign of linear.y is wrong where it is sent",
-    "command_mirrored": "left and right are exchanged where it is sent",
-    "command_both": "its sign is wrong where it is sent, or both motors are wired backward",
-    "wheels_both": "both encoders count backward",
-    "wheels_exchanged": "left and right encoders are exchanged",
-    "wheels_exchanged_both": "both encoders count backward, and are exchanged",
-    "gyro": "the gyro is mounted upside down",
-}
 _CHANGES: Mapping[str, Mapping[str, object]] = {
     "wheels_both": {"sign": -1},
     "wheels_exchanged": {"exchanged": True},
     "wheels_exchanged_both": {"sign": -1, "exchanged": True},
-}
-_REMEDIES = {
-    "pose_backward": " (heading_deg = 180 under [pose] in run.toml)",
-    "pose_mirrored": ' (up = "-z" under [pose] in run.toml)',
-    "wheels_both": " (sign = -1 under [wheels] in run.toml)",
-    "wheels_exchanged": " (exchanged = true under [wheels] in run.toml)",
-    "wheels_exchanged_both": " (sign = -1 and exchanged = true under [wheels] in run.toml)",
 }
 
 
@@ -51,27 +27,22 @@ def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Moti
         return motion
     turned, margin, other_deg = find_frame(motion, readings)
     if other_deg is not None and section.heading_deg is None:
-        text = (
-            f"the body does not follow what drives it along the headings of {source}, and a little across "
-            "them: their frame may be turned by 90 degrees, which too little tells; it is taken as recorded "
-            f"(heading_deg = {other_deg:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)"
-        )
-        case.findings.append(Finding("pose_undecided", "warning", text, where="pose", value=other_deg))
+        values = {"value": other_deg, "source": str(source)}
+        case.findings.append(Finding("pose_undecided", "warning", "pose", values))
     if not margin:
         return motion
     if section.heading_deg is not None:
-        text = (
-            f"by the motion the heading of {source} is {turned.offset_deg:.0f} degrees off (or as much "
-            "less half a turn), but [pose] in run.toml gives heading_deg, which is taken as it is given"
-        )
-        case.findings.append(Finding("pose_contradicted", "warning", text, where="pose", value=margin))
+        about = {
+            "kind": "heading",
+            "value": margin,
+            "source": str(source),
+            "offset_deg": turned.offset_deg,
+        }
+        case.findings.append(Finding("pose_contradicted", "warning", "pose", about))
         return motion
     if turned.flip:
-        text = (
-            f"the headings of {source} turn against its own path: its frame is of the other hand; "
-            "correct what publishes it"
-        )
-        case.findings.append(Finding("pose_flipped", "error", text, where="pose", value=margin))
+        flipped = {"value": margin, "source": str(source)}
+        case.findings.append(Finding("pose_flipped", "error", "pose", flipped))
     for one in readings:
         one.explain(turned)
     return turned
@@ -129,11 +100,8 @@ def report_axes(case: Case, command: Candidate | None) -> None:
     margin = 0.0 if command is None else rate_map_axes(command.reading)
     if command is None or margin < CLEAR:
         return
-    text = (
-        f"the commands of {command.source} are along the axes of a map, and the base turns them by its "
-        "heading (field-centric driving): record them as they are along the body's own axes"
-    )
-    case.findings.append(Finding("command_of_map", "error", text, where="command", value=margin))
+    values = {"value": margin, "source": str(command.source)}
+    case.findings.append(Finding("command_of_map", "error", "command", values))
 
 
 def report_speed_alone(case: Case, drives: Sequence[Candidate | None]) -> None:
@@ -145,35 +113,21 @@ def report_speed_alone(case: Case, drives: Sequence[Candidate | None]) -> None:
         # A vehicle that is driven straight on, and drifts, does not turn round.
         if drive.reading.second.moves or np.ptp(np.cumsum(made.motion.yaw)) < np.pi:
             continue
-        text = (
-            f"{drive.source} says a speed, and a yaw rate of zero throughout, though the vehicle turns: its "
-            "errors of heading, and what they make of positions, say nothing (yaw_rate_topic and speed_topic "
-            "in run.toml name two topics, as of a gyro)"
-        )
-        case.findings.append(Finding("no_yaw_rate", "warning", text, where=drive.source.signals[0].topic))
+        topic = drive.source.signals[0].topic
+        case.findings.append(Finding("no_yaw_rate", "warning", topic, {"source": str(drive.source)}))
 
 
 def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
     source = case.sources.pose
-    who, drivers = _name_witnesses(signs, "turned"), _name_witnesses(signs, "ahead")
+    who, drivers = _list_witnesses(signs, "turned"), _list_witnesses(signs, "ahead")
     if up != "z":
-        direction, axis = ("down" if up.startswith("-") else "up"), up.removeprefix("-")
-        what = f"the {axis} axis of the poses of {source} points {direction}"
-        if axis == "z":
-            what += " (north, east, down)"
-        else:
-            what += ", as of motion capture or of a camera's optical frame: the body turns about it"
-        case.correct("pose", f"{what}, as {who} show", f'up = "{up}"', {"up": up})
+        values = {"source": str(source), "up": up, "witnesses": who}
+        case.correct("pose", "axis up", values, f'up = "{up}"', {"up": up})
     if offset:
-        side = "right" if offset > 0.0 else "left"
-        off = f"{abs(offset):.0f} degrees to the {side}"
-        what = f"the heading of {source} is {off} of the course of {drivers}"
-        if abs(offset) == _HALF_TURN:
-            what = (
-                f"the poses of {source} look to the rear where {drivers} drive ahead (a sensor that is "
-                "mounted backward, or base_link points to the rear)"
-            )
-        case.correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": float(f"{offset:g}")})
+        fault = "looks to the rear" if abs(offset) == _HALF_TURN else "heading off"
+        off = {"source": str(source), "offset_deg": offset, "witnesses": drivers}
+        line = f"heading_deg = {offset:g}"
+        case.correct("pose", fault, off, line, {"heading_deg": float(f"{offset:g}")})
 
 
 def _report_fault(
@@ -186,14 +140,14 @@ def _report_fault(
     change: dict[str, object] = dict(_CHANGES.get(fault, {}))
     is_car = drive.reading.form == "steering"
     if change and (drive.reading.form == "sides" or (is_car and fault == "wheels_both")):
-        what = f"the speed of {drive.source} counts backward" if is_car else _FAULTS[fault]
         line = ", ".join(f"{key} = {str(value).lower()}" for key, value in change.items())
-        case.correct("wheels", what, line, change)
+        kind = "speed backward" if is_car else fault
+        case.correct("wheels", kind, {"source": str(drive.source)}, line, change)
         return
     role = "wheels" if drive is wheels else "command"
-    faults = "; or ".join(_FAULTS[one] for one in (fault, *others))
-    text = f"{drive.source} contradicts all other signals: {faults}"
-    case.findings.append(Finding(f"{role}_reversed", "error", text, where=role))
+    values = {"source": str(drive.source), "faults": [fault, *others]}
+    name = "wheels_reversed" if drive is wheels else "command_reversed"
+    case.findings.append(Finding(name, "error", role, values))
 
 
 def _report_either(
@@ -209,24 +163,20 @@ def _report_either(
         _report_fault(case, made.faults[0], command, wheels, [names[0] for names in made.rivals])
         return
     against = sorted({name for (name, _), sign in signs.items() if sign < 0})
-    verbs = {"ahead": "drive", "turned": "turn", "aside": "move sideways"}
     axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
-    remedies = {fault: f"{text}{_REMEDIES.get(fault, '')}" for fault, text in _FAULTS.items()}
-    options = "; or ".join(
-        " and ".join(remedies[name] for name in names) for names in (made.faults, *made.rivals)
-    )
-    text = (
-        f"{' and '.join(_AGAINST[name] for name in against)} and the poses "
-        f"{' and '.join(verbs[axis] for axis in axes)} opposite ways, and no third signal tells which of "
-        f"them is wrong: either {options}"
-    )
-    case.findings.append(Finding("signs_contradict", "error", text, where=f"{against[0]}, pose"))
+    values = {
+        "kind": "signal and poses",
+        "against": against,
+        "axes": axes,
+        "ways": [list(names) for names in ways],
+    }
+    case.findings.append(Finding("signs_contradict", "error", f"{against[0]}, pose", values))
 
 
-def _name_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> str:
+def _list_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> list[str]:
     """The signals that show in which way a body turns, or drives."""
     there = {name for (name, of), sign in signs.items() if sign and of == axis}
-    return enumerate_texts([word for name, word in _AGREE.items() if name in there]) or "the other signals"
+    return [name for name in ("command", "wheels", "gyro") if name in there]
 
 
 # Where the poses are on the body: the angle to its course, and the point about which it turns.
@@ -261,19 +211,14 @@ def report_mounting(case: Case, drives: Sequence[Candidate | None]) -> None:
     made = fit(motion.body.imag, columns, motion.steps)
     (angle, lever, _), (of_angle, of_lever, _) = made.gains.tolist(), made.t.tolist()
     if abs(of_angle) > CLEAR and abs(angle) > _LEAST_RAD:
-        degrees, given = np.degrees(angle), case.configuration.pose.heading_deg or 0.0
-        text = (
-            f"the body moves {abs(degrees):.1f} degrees (±{1.96 * abs(degrees / of_angle):.2g}) to the "
-            f"{'left' if angle > 0.0 else 'right'} of the headings of {pose}: their frame is turned, or the "
-            "body crabs, as on a bent axle or along a slope; no other signal tells which (heading_deg = "
-            f"{given + degrees:.1f} under [pose] in run.toml turns it)"
-        )
-        case.findings.append(Finding("pose_angle", "info", text, where="pose", value=angle))
+        degrees, given = float(np.degrees(angle)), case.configuration.pose.heading_deg or 0.0
+        turned = {
+            "value": angle,
+            "half_deg": 1.96 * abs(degrees / of_angle),
+            "heading_deg": given + degrees,
+            "pose": str(pose),
+        }
+        case.findings.append(Finding("pose_angle", "info", "pose", turned))
     if abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and known[0].form != "steering":
-        text = (
-            f"the body turns about a point {format_length(abs(lever))} "
-            f"(±{format_length(1.96 * abs(lever / of_lever))}) "
-            f"{'behind' if lever > 0.0 else 'ahead of'} that of the poses of {pose}: they are of a sensor "
-            "that is mounted there, or the wheels do not grip alike front and rear"
-        )
-        case.findings.append(Finding("pose_lever", "info", text, where="pose", value=lever))
+        apart = {"value": lever, "half_m": 1.96 * abs(lever / of_lever), "pose": str(pose)}
+        case.findings.append(Finding("pose_lever", "info", "pose", apart))

@@ -126,24 +126,15 @@ def _take_as_fast(reading: Reading, bursts: CommandTimeout, motion: Motion) -> C
 
 
 def _report(timeout: CommandTimeout, hold_s: float, *, in_bursts: bool) -> Finding:
-    said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
-    held = "commands are held for this time"
-    if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
-        held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
-    text = f"the base begins to stop {said} after the last command (from {timeout.silences} pauses): {held}"
-    if in_bursts:
-        text += (
-            "; commands are rarer than that, so that it drives in bursts: send them more often. It is taken "
-            "to be as fast as commanded in them: gains of the drive are not known from such a log"
-        )
-    return Finding(
-        "command_timeout",
-        "warning" if in_bursts else "info",
-        text,
-        where="command",
-        value=timeout.seconds,
-        count=timeout.silences,
-    )
+    values = {
+        "kind": "in bursts" if in_bursts else "held",
+        "value": timeout.seconds,
+        "count": timeout.silences,
+        "low": timeout.low,
+        "high": timeout.high,
+        "hold_s": hold_s,
+    }
+    return Finding("command_timeout", "warning" if in_bursts else "info", "command", values)
 
 
 def find_timeout(reading: Reading, motion: Motion, lever: float) -> CommandTimeout | None:
@@ -421,22 +412,23 @@ def resolve_delay(
         return
     reading = command.reading
     if case.driven is not None and wheels is not None:
-        followed, beside = "the wheels", [one.topic for one in wheels.source.signals]
+        followed, beside = "wheels", [one.topic for one in wheels.source.signals]
         made = _compare_delays(replace(reading, third=None, third_crossed=None), case.driven)
     elif motion is not None and reading.explained is not None and case.sources.pose is not None:
-        followed, beside = "poses", [case.sources.pose.topic]
+        followed, beside = "pose", [case.sources.pose.topic]
         made = _compare_delays(reading, reading.explained)
     else:
         return
     if made is None or (made.delay > 0.0 and case.driven is None):
         return
     if made.delay > 0.0:
-        text = (
-            f"{followed} begin to follow {command.source} {made.delay:.2f} s after its stamps, then with a "
-            f"lag of {made.lag:.2f} s: the drive answers so late, or the stamps are early; no other signal "
-            f"tells which (late_s = {-made.delay:.2f} under [command] in run.toml takes them for early)"
-        )
-        case.findings.append(Finding("command_delay", "info", text, where="command", value=made.delay))
+        values = {
+            "value": made.delay,
+            "lag_s": made.lag,
+            "source": str(command.source),
+            "followed": followed,
+        }
+        case.findings.append(Finding("command_delay", "info", "command", values))
         return
     late = round(-made.delay, 2)
     topics = [*(one.topic for one in command.source.signals), *beside]
@@ -444,15 +436,11 @@ def resolve_delay(
     by_body = reading.explained is not None and reading.explained.delay < -_ERROR_S
     if clocks == {"header"} and not by_body:
         # Times of recording are late by the way there; of two clocks either may be wrong.
-        text = (
-            f"{followed} follow {command.source} {late:.2f} s before it is sent, which nothing can: its "
-            f"stamps are late, or those of {followed} early, and no other signal tells which (late_s = "
-            f"{late:g} under [command] in run.toml corrects the first)"
-        )
-        case.findings.append(Finding("command_late", "warning", text, where="command", value=late))
+        early = {"value": late, "source": str(command.source), "followed": followed}
+        case.findings.append(Finding("command_late", "warning", "command", early))
         return
-    what = f"the stamps of {command.source} are {late:.2f} s late, for {followed} follow it before it is sent"
-    case.correct("command", what, f"late_s = {late:g}", {"late_s": late})
+    wrong = {"source": str(command.source), "late_s": late, "followed": followed}
+    case.correct("command", "late stamps", wrong, f"late_s = {late:g}", {"late_s": late})
     case.driven = None if case.driven is None else replace(made, delay=made.delay + late)
 
 

@@ -38,8 +38,7 @@ def resolve_gyro(case: Case, motion: Motion) -> tuple[Motion, Reading | None]:
         return motion, gyro
     if abs(np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])) > 4.0 * _NEAR:
         return motion, gyro
-    what = f"the gyro of {gyro.name} is in degrees per second"
-    case.correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
+    case.correct("imu", "gyro in degrees", {"gyro": gyro.name}, 'unit = "deg/s"', {"unit": "deg/s"})
     # Headings of positions alone are made of the gyro.
     case.extraction.take_degrees()
     motion, gyro = measure_motion(case.extraction.poses()) or motion, case.read_gyro()
@@ -68,7 +67,8 @@ def resolve_lengths(
     unit = find_pose_unit(gains["body"] or gains["steering"], gains["sides"], radius)
     if unit == "m":
         return motion
-    case.correct("pose", f"the positions of {source} are in {unit}", f'unit = "{unit}"', {"unit": unit})
+    values = {"source": str(source), "unit": unit}
+    case.correct("pose", "unit of positions", values, f'unit = "{unit}"', {"unit": unit})
     case.extraction.configuration = case.complete()
     scaled = measure_motion(case.extraction.poses())
     if scaled is None:
@@ -148,8 +148,9 @@ def _find_side_unit(case: Case, command: Candidate, wheels: Candidate | None) ->
     driven, unit = case.driven, case.changes.get("wheels", {}).get("unit")
     if wheels is not None and wheels.reading.form == "sides" and driven is not None:
         if unit is not None and abs(np.log(abs(float(driven.ahead.gains[0])))) < np.log(_ALIKE):
-            what = f"the wheel speeds of {command.source} are in {unit}, as those that are measured"
-            case.correct("command", what, f'unit = "{unit}"', {"unit": unit}, usual="rad/s")
+            values = {"source": str(command.source), "unit": unit}
+            line = f'unit = "{unit}"'
+            case.correct("command", "unit as measured", values, line, {"unit": unit}, usual="rad/s")
     elif wheels is None and command.reading.explained is not None and command.sign("ahead"):
         explained = command.reading.explained
         radius = case.vehicle.wheel_radius_m if case.is_known else None
@@ -189,7 +190,8 @@ def _report_units(
         ("steering_unit", "steering angle") if drive.steering is units else ("yaw_unit", "yaw rate")
     )
     for index, (key, what) in enumerate((("unit", "speed"), (turn_key, turn))):
-        unit, of = units.likeliest[index], f"the {what} of {drive.source}"
+        unit = units.likeliest[index]
+        of: dict[str, object] = {"what": what, "source": str(drive.source), "unit": unit}
         if getattr(section, key) is not None or not unit:
             continue
         is_too_fast = key == "unit" and drive.reading.form == "body" and (gains[0] or 0.0) > _FASTEST
@@ -199,17 +201,14 @@ def _report_units(
             speed, gain = units.likeliest[0], gains[0]
             is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
             case.is_scaled = case.is_scaled and is_sure
-            unsure = ", or has no unit, as percent of a throttle, whose gains say nothing of the robot"
-            text = f"{of} is in {unit}{'' if is_sure else unsure}"
-            case.correct(role, text, f'{key} = "{unit}"', {key: unit}, usual="m/s")
+            values = {**of, "is_sure": bool(is_sure)}
+            case.correct(role, "unit of a drive", values, f'{key} = "{unit}"', {key: unit}, usual="m/s")
         elif units.rival is not None and units.rival[index] != unit:
             other, gain = units.rival[index], gains[index]
-            seen = "" if gain is None else f": the body moves {gain:.3g} times as far as it says"
-            text = (
-                f"{of} may be in {other}{seen}; it is taken as {unit}, and no other signal tells which "
-                f'({key} = "{other}" under [{role}] in run.toml takes it so, {key} = "{unit}" settles it)'
-            )
-            case.findings.append(Finding("unit_undecided", "warning", text, where=role, value=gain))
+            values = {**of, "other": other, "key": key}
+            if gain is not None:
+                values["value"] = float(gain)
+            case.findings.append(Finding("unit_undecided", "warning", role, values))
 
 
 def _find_wheel_unit(case: Case, command: Candidate | None, wheels: Candidate) -> None:
@@ -239,15 +238,14 @@ def correct_wheel_unit(
     if wheels.source.signals[0].unit or getattr(case.configuration, role).unit is not None:
         return
     unit = find_wheel_unit(gain, share, str(wheels.source), radius)
-    what = f"the wheel speeds of {wheels.source} are in "
-    taken = "" if radius is not None else f": taken as those of wheels of {TAKEN_M} m, which alters no slip"
+    values: dict[str, object] = {"source": str(wheels.source), "unit": unit}
+    if radius is None and (not unit or unit in RIMS):
+        values["taken_m"] = TAKEN_M
     if not unit:
-        what += f"no usual unit (ticks, or turns before a gear?){taken}"
         scale = float(f"{gain / TAKEN_M:.4g}")
-        case.correct(role, what, f"scale = {scale:g}", {"scale": scale})
+        case.correct(role, "unit of wheels", values, f"scale = {scale:g}", {"scale": scale})
     elif unit != "rad/s":
-        what += f"{unit}{taken if unit in RIMS else ''}"
-        case.correct(role, what, f'unit = "{unit}"', {"unit": unit}, usual="rad/s")
+        case.correct(role, "unit of wheels", values, f'unit = "{unit}"', {"unit": unit}, usual="rad/s")
 
 
 def _is_usable(drive: Candidate) -> bool:

@@ -37,6 +37,7 @@ from pipeline.core import (
     shorten,
     suffix_unit,
 )
+from pipeline.stages import Finding
 from pipeline.store import LOG_NOTES, Manifest, Store, date_runs
 
 if TYPE_CHECKING:
@@ -143,9 +144,9 @@ def format_distance(metres: float | None) -> str:
     return f"{metres / _KILOMETRE:.2f} km" if metres >= _KILOMETRE else f"{metres:.0f} m"
 
 
-def count_serious(findings: Iterable[Mapping[str, object]]) -> dict[str, str]:
+def count_serious(findings: Iterable[Finding]) -> dict[str, str]:
     """Number of findings of each serious severity as text, such as `2 warnings`."""
-    severities = [str(finding.get("severity")) for finding in findings]
+    severities = [finding.severity for finding in findings]
     counts = {name: severities.count(name) for name in ("error", "warning")}
     return {name: f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count}
 

@@ -13,6 +13,7 @@ from pipeline.report.motion_view import MotionView
 from pipeline.report.theme import round_up, usual_ends
 from pipeline.results import RunDiagnosis, find_refusal, read_findings
 from pipeline.run import HORIZON_S
+from pipeline.words import format_finding
 
 INPUTS = ("command", "measured")
 NOT_DIAGNOSED = RunDiagnosis()
@@ -78,7 +79,8 @@ class RunReport:
     @property
     def refusal(self) -> str:
         """Finding that makes every fit to the run meaningless; empty without one."""
-        return find_refusal(read_findings(self.summary))
+        refusal = find_refusal(read_findings(self.summary))
+        return "" if refusal is None else format_finding(refusal)
 
     def text(self, key: str) -> str:
         """Text of the summary; empty if missing."""

@@ -35,7 +35,16 @@ from pipeline.report.figures.residual_figures import REACH, RESIDUALS, SIGNATURE
 from pipeline.report.figures.slip_figures import COMMAND_SPACE, MODULUS, STEP_RESPONSE, TRAJECTORY
 from pipeline.report.figures.stretch_figures import MOTION, PATHS
 from pipeline.report.scene import RunReport
-from pipeline.results import Named, has_no_pose, is_small, read_findings, split_main
+from pipeline.results import (
+    Named,
+    has_no_pose,
+    is_small,
+    key_finding,
+    read_finding_table,
+    read_findings,
+    split_main,
+)
+from pipeline.stages import Finding
 from pipeline.words import (
     describe_cause,
     describe_motion,
@@ -43,6 +52,7 @@ from pipeline.words import (
     describe_rest,
     describe_separation,
     describe_unexplained,
+    format_finding,
     format_remaining_error,
     format_short,
     format_suggestion,
@@ -68,7 +78,7 @@ _STEPS_SHOWN = 3
 
 def view_glance(report: RunReport) -> dict[str, object]:
     """The verdict, and findings that forbid conclusions."""
-    doubts = (str(one.get("text", "")) for one in list_findings(report) if one.get("severity") == "error")
+    doubts = (format_finding(one) for one in list_findings(report) if one.severity == "error")
     return {
         "verdict": report.verdict,
         "doubts": [text for text in doubts if text.casefold() not in report.verdict.casefold()],
@@ -241,13 +251,12 @@ def view_health(report: RunReport) -> dict[str, object]:
     }
 
 
-def list_findings(report: RunReport) -> list[Mapping[str, object]]:
+def list_findings(report: RunReport) -> list[Finding]:
     """Findings of the summary, or otherwise of the table, the most severe first."""
-    findings = report.items("findings")
-    table = report.table("findings")
+    findings, table = read_findings(report.summary), report.table("findings")
     if not findings and table is not None:
-        findings = list(table.iter_rows(named=True))
-    return sorted(findings, key=lambda finding: _RANK.get(str(finding.get("severity")), len(_RANK)))
+        findings = read_finding_table(table)
+    return sorted(findings, key=lambda finding: _RANK[finding.severity])
 
 
 def summarise_health(report: RunReport) -> list[tuple[str, str]]:
@@ -263,7 +272,7 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
         gaps = int(segments) - 1
         strip.append(("good", "no gaps") if gaps <= 0 else ("note", f"{int(segments):,} segments"))
     findings = list_findings(report)
-    repeated = next((number_in(one, "value") for one in findings if one.get("id") == "held_poses"), None)
+    repeated = next((one.value for one in findings if one.id == "held_poses"), None)
     if repeated is not None:
         strip.append(("note", f"{format_known_share(repeated)} of the poses repeated"))
     elif report.number("held_poses") == 0:
@@ -272,19 +281,17 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     return strip
 
 
-def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:
-    severity = str(finding.get("severity", "info"))
-    grade = severity if severity in _RANK else "info"
-    places = [str(finding["where"])] if finding.get("where") else []
-    start, end = number_in(finding, "t_start"), number_in(finding, "t_end")
+def _view_finding(finding: Finding) -> dict[str, object]:
+    places = [finding.where] if finding.where else []
+    start, end = finding.t_start, finding.t_end
     if start is not None:
         places.append(f"at {format_number(start)} s" if end is None else _format_stretch(start, end))
     return {
-        "grade": grade,
-        "word": _SEVERITY_WORDS[grade],
-        "text": str(finding.get("text", "")),
+        "grade": finding.severity,
+        "word": _SEVERITY_WORDS[finding.severity],
+        "text": format_finding(finding),
         "places": places,
-        "id": finding.get("id", ""),
+        "id": finding.id,
     }
 
 
@@ -466,10 +473,10 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "unexplained", "; ".join(filter(None, texts)), (rest.formula or "") if terms else ""
     if diagnosis.unobservable_why:
         yield "not observable in this log", ", ".join(map(name_term, diagnosis.unobservable_why)), ""
-    known = {str(entry.get("text", "")) for entry in list_findings(report)}
+    known = set(map(key_finding, list_findings(report)))
     for finding in diagnosis.findings:
-        if finding.text not in known:
-            yield "finding", finding.text, ""
+        if key_finding(finding) not in known:
+            yield "finding", format_finding(finding), ""
     if diagnosis.disturbance is not None and diagnosis.unexplained is None:
         yield "residual", describe_rest(diagnosis), ""
 

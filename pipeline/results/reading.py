@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 
-from pipeline.core import JSON_DIGITS, format_share, number_in, objects_in, round_digits
+from pipeline.core import JSON_DIGITS, format_share, mapping_in, number_in, objects_in, round_digits
 from pipeline.recording import FAULTS
-from pipeline.results.structs import Errors, Finding, RunDiagnosis, Step
+from pipeline.results.structs import Errors, RunDiagnosis, Step, round_numbers
 from pipeline.run import GROUND_UNOBSERVABLE
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from pipeline.models import Effect, ModelFile
     from pipeline.sources import Vehicle
+    from pipeline.store import JSON
 
 Entry = TypeVar("Entry")
 
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """Quantity and unit by name in `Errors` and in JSON."""
-_TEXTS = ("id", "text", "where", "severity")
 NOTHING = 1e-3
 """Relative increase below which an error counts as unchanged: rounding of fits."""
 # Two fits of one model differ by as much on other folds: a step may raise one error by this share.
@@ -48,20 +52,43 @@ _MAIN_SHARE = 0.1
 
 def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
     """The ``findings`` of a run's JSON object."""
-    return tuple(
-        Finding(
-            **{name: str(one.get(name) or "") for name in _TEXTS},  # type: ignore[arg-type]
-            value=one.get("value"),
-            t_start=number_in(one, "t_start"),
-            t_end=number_in(one, "t_end"),
-        )
-        for one in objects_in(content, "findings")
+    return tuple(map(_read_finding, objects_in(content, "findings")))
+
+
+def read_finding_table(table: pl.DataFrame) -> tuple[Finding, ...]:
+    """The findings of a run's table."""
+    rows = table.iter_rows(named=True)
+    return tuple(_read_finding({**row, "values": parse_values(row["values"])}) for row in rows)
+
+
+def parse_values(text: object) -> JSON:
+    """The values of a finding from their column; empty where it is no JSON."""
+    try:
+        return cast("JSON", json.loads(str(text)))
+    except (ValueError, RecursionError):
+        return {}
+
+
+def _read_finding(content: Mapping[str, object]) -> Finding:
+    severity = content.get("severity")
+    return Finding(
+        str(content.get("id") or ""),
+        "error" if severity == "error" else "warning" if severity == "warning" else "info",
+        str(content.get("where") or ""),
+        mapping_in(content, "values"),
+        t_start=number_in(content, "t_start"),
+        t_end=number_in(content, "t_end"),
     )
 
 
-def find_refusal(findings: Iterable[Finding]) -> str:
-    """The finding that makes every fit to a run meaningless; empty where there is none."""
-    return next((one.text for one in findings if one.id in FATAL), "")
+def key_finding(finding: Finding) -> tuple[str, str, str]:
+    """By what two findings are compared: id, place and values, these as JSON has them."""
+    return finding.id, finding.where, json.dumps(round_numbers(finding.values), sort_keys=True)
+
+
+def find_refusal(findings: Iterable[Finding]) -> Finding | None:
+    """The finding that makes every fit to a run meaningless; None where there is none."""
+    return next((one for one in findings if one.id in FATAL), None)
 
 
 def has_no_pose(findings: Iterable[Finding]) -> bool:

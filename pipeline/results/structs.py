@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from pipeline.core import JSON_DIGITS, count_places, finite_or_none
 from pipeline.sources import Vehicle
+from pipeline.stages import Finding
 from pipeline.store import convert_stored
 
 Result = TypeVar("Result", bound=msgspec.Struct)
@@ -343,32 +344,6 @@ class Unexplained(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     with_formula: Errors | None = None
 
 
-class Finding(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What was noticed of a run, by a stage or by the diagnosis.
-
-    Attributes:
-        id: stable id.
-        text: sentence, made where it was noticed.
-        where: what it is about.
-        severity: `error`, `warning` or `info`.
-        value: its number.
-        t_start, t_end: of an incident [s].
-        parameter, time, before, after: of a number that changes so long after the start of the run [s].
-    """
-
-    id: str = ""
-    text: str = ""
-    where: str | None = None
-    severity: str = ""
-    value: object = None
-    t_start: float | None = None
-    t_end: float | None = None
-    parameter: str | None = None
-    time: float | None = None
-    before: float | None = None
-    after: float | None = None
-
-
 class Delays(msgspec.Struct, frozen=True):
     """Delays of a run [s], and the source of its heading: `gyro` or `pose`."""
 
@@ -561,15 +536,16 @@ _NUMBERS = frozenset(
 
 def to_json(result: msgspec.Struct) -> dict[str, Json]:
     """A result as JSON: six digits, null for what is not known."""
-    return cast("dict[str, Json]", _round(msgspec.to_builtins(result)))
+    return cast("dict[str, Json]", round_numbers(msgspec.to_builtins(result)))
 
 
-def _round(value: object) -> object:
+def round_numbers(value: object, digits: int | None = JSON_DIGITS) -> object:
+    """An object with numbers of so many digits, by default of JSON; None for those that are not finite."""
     if isinstance(value, float):
-        return finite_or_none(value, JSON_DIGITS)
+        return finite_or_none(value, digits)
     if isinstance(value, dict):
-        return {key: _round(one) for key, one in value.items()}
-    return [_round(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: round_numbers(one, digits) for key, one in value.items()}
+    return [round_numbers(one, digits) for one in value] if isinstance(value, list | tuple) else value
 
 
 def read_result(content: Mapping[str, object], kind: type[Result], where: Path = Path()) -> Result:

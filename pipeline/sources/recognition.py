@@ -222,12 +222,12 @@ class Recognized:
     Attributes:
         vehicle: the vehicle.
         source: source of the recognition.
-        notes: remarks to report.
+        notes: values of findings `vehicle_choice`.
     """
 
     vehicle: Vehicle
     source: VehicleSource
-    notes: tuple[str, ...] = ()
+    notes: tuple[Mapping[str, object], ...] = ()
 
 
 def recognize_vehicle(
@@ -283,14 +283,12 @@ def _compare(preset: Vehicle, source: VehicleSource, description: Description | 
     """A platform with the values of its preset; deviations of the description are reported."""
     if description is None:
         return Recognized(preset, source)
-    notes = []
+    notes = list[Mapping[str, object]]()
     for name in _GEOMETRY:
         known, said = getattr(preset, name), getattr(description, name)
         if known and said and abs(said / known - 1.0) > _DIFFERS:
-            notes.append(
-                f"the robot description says {name} = {said:.4g}, the preset {preset.id} {known:g}: the "
-                f"preset is used; vehicle.{name} = {said:.4g} uses the other"
-            )
+            values = {"kind": "description", "key": name, "described": said, "preset": preset.id}
+            notes.append({**values, "known": known})
     return Recognized(preset, "robot_description", tuple(notes))
 
 
@@ -433,9 +431,14 @@ def apply_parameters(recognized: Recognized, controller: Controller) -> Recogniz
     """A recognized vehicle with the geometry of its controller's parameters, which have priority."""
     geometry = controller.geometry
     notes = [
-        f"the parameters of {controller.name} say {key} = {value:.4g}, "
-        f"the {recognized.source.replace('_', ' ')} "
-        f"{getattr(recognized.vehicle, key):.4g}: the parameters are used"
+        {
+            "kind": "parameters",
+            "controller": controller.name,
+            "key": key,
+            "set": value,
+            "source": recognized.source,
+            "known": getattr(recognized.vehicle, key),
+        }
         for key, value in geometry.items()
         if getattr(recognized.vehicle, key)
         and abs(value / getattr(recognized.vehicle, key) - 1.0) > _PARAMETER_DIFFERS

@@ -11,10 +11,10 @@ from pipeline.door import open_door
 if TYPE_CHECKING:
     from pipeline.stages.align import align_tables
     from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
-    from pipeline.stages.clocks import describe_pauses, find_pauses
+    from pipeline.stages.clocks import find_pauses
     from pipeline.stages.drive import choose_sides, list_steered
     from pipeline.stages.extract import Extracted, Extraction, Given, extract_tables
-    from pipeline.stages.findings import Finding, Severity, StageError, blame_damage, tabulate_findings
+    from pipeline.stages.findings import Finding, Severity, StageError, blame_damage
     from pipeline.stages.inputs import WINDOW_S
     from pipeline.stages.lost_messages import number_gaps
     from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose

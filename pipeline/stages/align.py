@@ -150,14 +150,11 @@ def _report(alignment: Alignment) -> list[Finding]:
     findings = []
     late, spread, outlier_s = alignment.wheel_delay_s, alignment.latency_spread_s, alignment.outlier_s
     if late > 0.0:
-        text = f"the encoders are {late * 1e3:.0f} ms late against the gyro (a filter or a clock): corrected"
-        findings.append(Finding("wheels_delay", "info", text, where="wheels", value=late))
+        findings.append(Finding("wheels_delay", "info", "wheels", {"value": late}))
     if spread > 0.0:
-        text = f"the latency of poses varies by {spread:.2g} s: corrected with gyro and path"
-        findings.append(Finding("pose_latency", "info", text, where="pose", value=spread))
+        findings.append(Finding("pose_latency", "info", "pose", {"value": spread}))
     if outlier_s > 0.0:
-        text = f"{outlier_s:.3g} s excluded: the localization contradicts the wheels there"
-        findings.append(Finding("pose_outliers", "info", text, where="pose", value=outlier_s))
+        findings.append(Finding("pose_outliers", "info", "pose", {"value": outlier_s}))
     return findings
 
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, Ints, fit_robustly, format_share, robust_spread
+from pipeline.core import Flags, Floats, Ints, fit_robustly, robust_spread
 from pipeline.run import LIVE_SHARE, STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages.findings import SURE, Finding
@@ -60,12 +60,8 @@ def check_side_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     if abs(scale) < _LEAST_SCALE or abs(of_command + of_body) > abs(scale):
         return []
     low = "left" if scale < 0.0 else "right"
-    text = (
-        f"the {low} wheels' encoder reads {format_share(1.0 - np.exp(-abs(scale)))} low against the other "
-        "side: more is commanded there, and the vehicle does not turn accordingly (another gear or "
-        "resolution?)"
-    )
-    return [Finding("wheel_scale", "warning", text, where=f"wheels {low}", value=float(np.exp(-abs(scale))))]
+    values = {"value": float(np.exp(-abs(scale))), "side": low}
+    return [Finding("wheel_scale", "warning", f"wheels {low}", values)]
 
 
 def _find_sides(velocity: Floats, track_m: float) -> Floats:
@@ -111,19 +107,12 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     for unit, factor in list_factors("rad/s", "m/s").items():
         if _LEAST < gain / factor < _MOST:
             fastest = float(np.max(np.abs(driven[known])))
-            text = (
-                f"the measured wheels reach {fastest:.3g} m/s, and the vehicle covers {gain:.3g} times their "
-                f'distance: if they are in {unit}, set [wheels] unit = "{unit}" in run.toml'
-            )
-            return [Finding("unit_wrong", "error", text, where="wheels", value=gain)]
+            values = {"kind": "of the motion", "value": gain, "unit": unit, "fastest_mps": fastest}
+            return [Finding("unit_wrong", "error", "wheels", values)]
     radius = vehicle.wheel_radius_m
-    text = (
-        f"the vehicle covers {format_share(gain)} of the distance that wheels with a radius of {radius:.3g} "
-        f"m roll: if the radius is {radius * gain:.3g} m, give --wheel-radius {radius * gain:.3g} or another "
-        f"--vehicle (in the controller: a wheel radius multiplier of {gain:.2g}); or the positions have no "
-        "scale, as those of a single camera"
-    )
-    return [Finding(WRONG_RADIUS, "error", text, where="wheels", value=radius * gain)]
+    return [
+        Finding(WRONG_RADIUS, "error", "wheels", {"value": radius * gain, "gain": gain, "radius_m": radius})
+    ]
 
 
 def is_grip(gain: float, others: Iterable[float]) -> bool:
@@ -247,11 +236,7 @@ def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     live = both & (np.abs(samples.command) > STILL_MPS).any(axis=1)
     if live.sum() < FEWEST_SAMPLES or float(np.abs(samples.measured[both]).max()) > 0.0:
         return []
-    text = (
-        "the measured wheels are zero throughout while commands are live: "
-        "an emergency stop was pressed, or the encoders are dead"
-    )
-    return [Finding("wheels_dead", "error", text, where="wheels", count=int(live.sum()))]
+    return [Finding("wheels_dead", "error", "wheels", {"count": int(live.sum())})]
 
 
 def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
@@ -275,10 +260,10 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     net = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
     turned = float(np.abs(ideal[known, 2]).sum() * period)
     if path < _NET_OF_NO_MOTION and turned < _NET_OF_NO_MOTION:
-        text = f"the vehicle was hardly commanded to move: {path:.2g} m of path in the whole run"
+        values: dict[str, object] = {"kind": "hardly commanded", "value": path}
         if net > _NET_OF_NO_MOTION:
-            text += f", but it moved, {net:.2g} m far: it was pushed, or what drove it is not recorded"
-        return [Finding("not_moving", "error", text, value=path)]
+            values["moved_m"] = net
+        return [Finding("not_moving", "error", "", values)]
     gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in range(3)]
     still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
     # Wheels on a stand, or in a test of steps, may turn as much back as ahead.
@@ -287,16 +272,14 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     # Sideways motion counts only without a forward command.
     covered = gains[0] or gains[1]
-    source = "turned by the wheels" if ideal is samples.measured else "commanded"
-    driven = f"{path:.0f}" if path >= 10.0 else f"{path:.2g}"  # noqa: PLR2004 - two digits
-    if samples.is_drive_alone:
-        text = f"the wheels do not turn: they rolled {format_share(covered, 0)} of the {driven} m {source}"
-        return [Finding("not_moving", "error", text, value=covered)]
-    text = (
-        f"the vehicle does not move: it covered {format_share(covered, 0)} of the {driven} m {source} and "
-        f"stayed within {net:.2g} m (wheels in the air, blocked, or stopped)"
-    )
-    return [Finding("not_moving", "error", text, value=covered)]
+    values = {
+        "kind": "wheels stand" if samples.is_drive_alone else "body stands",
+        "value": covered,
+        "path_m": path,
+        "of": "wheels" if ideal is samples.measured else "command",
+        "moved_m": net,
+    }
+    return [Finding("not_moving", "error", "", values)]
 
 
 def _gain_on(velocity: Floats, ideal: Floats) -> float:
@@ -321,18 +304,10 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         share = float(np.mean(beyond))
         if share > 0.01:  # noqa: PLR2004 - a hundredth of the samples is no accident
             name, reached = "speed" if axis == 0 else "yaw rate", float(np.median(moved[beyond]))
-            text = (
-                f"the commanded {name} exceeds the vehicle's limit ({limit:g} {unit}) for "
-                f"{format_share(share)} of the time: "
-            )
-            text += (
-                f"the vehicle then reaches {reached:.2g} {unit} (median), so this limit does not act"
-                if reached > limit * 1.02
-                else "the controller may clip it"
-            )
-            findings.append(
-                Finding("command_beyond_limit", "info", text, where=f"command {name}", value=share)
-            )
+            values = {"value": share, "name": name, "limit": limit, "unit": unit}
+            if reached > limit * 1.02:
+                values["reached"] = reached
+            findings.append(Finding("command_beyond_limit", "info", f"command {name}", values))
     return findings
 
 
@@ -349,15 +324,10 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if along is not None and turning is not None and samples.measured is not None:
         skew = turning[0] - along[0]
         if abs(skew) > max(_SKEW, SURE * float(np.hypot(along[1], turning[1]))):
-            order = "lags" if skew > 0.0 else "leads"
-            text = (
-                f"compared with the wheels, the heading {order} the position by {abs(skew) * 1e3:.0f} ms: "
-                "the localization delays them differently (similar to lateral skid), or the body has inertia"
-            )
             from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
 
             name = find_late_effect(Late.HEADING).id
-            findings.append(Finding(name, "warning", text, where="pose", value=skew))
+            findings.append(Finding(name, "warning", "pose", {"value": skew}))
     return findings
 
 

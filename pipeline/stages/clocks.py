@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.core import PAUSE_NS, Flags, Floats, Ints, format_duration, robust_spread
+from pipeline.core import PAUSE_NS, Flags, Floats, Ints, robust_spread
 from pipeline.logs import LATEST_NS
 from pipeline.stages import timing
 from pipeline.stages.findings import Finding, Severity, StageError
@@ -136,15 +136,14 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     findings = simulated + drifts + bunches
     if pauses:
         longest, count = max(after - last for last, after in pauses) / 1e9, len(pauses)
-        text = describe_pauses(pauses, "no topic in use")
-        jump = Finding("clock_jump", "warning", text, where="recorder", value=longest, count=count)
+        values = {"kind": "pause of topics in use", "value": longest, "count": count}
+        jump = Finding("clock_jump", "warning", "recorder", values)
         findings.insert(0, jump)
     unset = sum(int((times.log_time >= LATEST_NS).sum()) for times in recorded.values())
     if unset:
-        text = (
-            f"{unset} messages were recorded by a clock that is not set: it shows a time after the year 2116"
+        findings.insert(
+            0, Finding("clock_unset", "warning", "recorder", {"kind": "recorder", "count": unset})
         )
-        findings.insert(0, Finding("clock_unset", "warning", text, where="recorder", count=unset))
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
     for clock in clocks.values():
         _require_advance(clock)
@@ -179,21 +178,6 @@ def find_pauses(log_times: Iterable[Stamps]) -> list[tuple[int, int]]:
     log = np.sort(np.concatenate([np.empty(0, dtype=np.int64), *log_times]), kind="stable")
     last = np.flatnonzero(np.diff(log) > PAUSE_NS)
     return list(zip(log[last].tolist(), log[last + 1].tolist(), strict=True))
-
-
-def describe_pauses(pauses: Sequence[tuple[int, int]], silent: str = "nothing") -> str:
-    """A sentence on silences of a recording, without full stop.
-
-    Args:
-        pauses: as of `find_pauses`, at least one.
-        silent: what was not recorded.
-    """
-    longest = format_duration(max(after - last for last, after in pauses) / 1e9)
-    most = longest if len(pauses) == 1 else f"up to {longest}"
-    return (
-        f"{silent} was recorded for {most}: the recorder's clock was set, or the recording paused; "
-        "that time does not count"
-    )
 
 
 def _close_pauses(
@@ -283,14 +267,9 @@ def _follow(
                 real.append(times.topic)
         publish = clock_map.follow(times.publish_time)
         mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
-    also = f"; so were the stamps of {', '.join(real)}, which are not simulated time" if real else ""
-    text = (
-        f"the stamps run {clock_map.rate:.3g} times as fast as the recorder's clock, and speeds are per "
-        "second of the stamps: right for a simulation at this real-time factor, wrong for a robot, whose "
-        f"clock then needs mending. Log times were mapped onto the stamps by those of {leading}{also}"
-    )
     severity: Severity = "info" if abs(clock_map.rate - 1.0) < _OTHER_RATE else "warning"
-    return mapped, [Finding("simulated_time", severity, text, where=leading, value=clock_map.rate)]
+    values = {"value": clock_map.rate, "other_topics": real}
+    return mapped, [Finding("simulated_time", severity, leading, values)]
 
 
 def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
@@ -325,11 +304,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         change = np.where(used, np.rint(-rate * (header - drift.find_agreement())), 0.0).astype(np.int64)
         steady[key] = replace(recorded[key], header_time=header + change)
         run_away = abs(rate) * float(np.ptp(header[used])) / 1e9
-        text = (
-            f"the clock of {topic} runs {abs(rate) * 1e6:.0f} ppm {'fast' if rate > 0.0 else 'slow'} against "
-            f"the recorder's ({run_away * 1e3:.0f} ms over the run): its stamps were corrected"
-        )
-        findings.append(Finding("clock_drift", "info", text, where=topic, value=rate * 1e6))
+        findings.append(Finding("clock_drift", "info", topic, {"value": rate * 1e6, "run_s": run_away}))
     return steady, findings
 
 
@@ -344,11 +319,7 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
             continue
         even[key] = replace(times, log_time=log)
         late = _find_held_up_s(times.log_time, log)
-        text = (
-            f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
-            "messages were spread at the rate of their sender"
-        )
-        findings.append(Finding("bunched_times", "info", text, where=times.topic, value=late))
+        findings.append(Finding("bunched_times", "info", times.topic, {"value": late}))
     return even, findings
 
 
@@ -416,8 +387,7 @@ def _read_clock(times: Recorded) -> TopicClock:
         findings: list[Finding] = []
         if header is not None and not times.is_stamped:
             same = "the same" if header.any() else "zero"
-            text = f"the header stamps of {times.topic} are all {same}: log times were used"
-            findings.append(Finding("no_header_stamp", "warning", text, where=times.topic))
+            findings.append(Finding("no_header_stamp", "warning", times.topic, {"stamps": same}))
         usable = np.ones(times.log_time.size, dtype=bool)
         return TopicClock(times.topic, "log", times.log_time, usable, findings=tuple(findings))
     stamp, breaks, findings = _mend_jumps(times.topic, header, times.log_time)
@@ -426,11 +396,7 @@ def _read_clock(times: Recorded) -> TopicClock:
 
 
 def _flag_placed(topic: str, count: int) -> Finding:
-    text = (
-        f"{count} stamps of {topic} come from before the clock was set (1970): "
-        "they were placed by their log times"
-    )
-    return Finding("clock_unset", "warning", text, where=topic, count=count)
+    return Finding("clock_unset", "warning", topic, {"kind": "stamps", "count": count})
 
 
 def _mend_jumps(
@@ -481,11 +447,8 @@ def _mend_jumps(
             jumps += 1
             largest = max(largest, abs(shift))
     if jumps:
-        text = (
-            f"the clock of {topic} jumped by up to {largest / 1e9:.3g} s while the recorder's ran on: "
-            "its stamps were corrected with their log times, and the run is split there"
-        )
-        findings.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
+        values = {"kind": "jump", "value": largest / 1e9, "count": jumps}
+        findings.append(Finding("clock_jump", "warning", topic, values))
     breaks = [int(log_time[span[0]]) for span in spans[1:]]
     if early.size and early[-1] + 1 < header.size:
         breaks = sorted({*breaks, int(log_time[early[-1] + 1])})
@@ -500,14 +463,7 @@ def _is_future(before: Ints | float, after: Ints | float) -> Flags | bool:
 def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
     """Report stamps later than their recording, which prove that two clocks disagree."""
     return [
-        Finding(
-            "stamp_after_log_time",
-            "warning",
-            f"the stamps of {clock.topic} lie {_format_offset(-clock.latency_s)} after they were recorded: "
-            "its clock runs ahead",
-            where=clock.topic,
-            value=clock.latency_s,
-        )
+        Finding("stamp_after_log_time", "warning", clock.topic, {"value": clock.latency_s})
         for clock in clocks.values()
         if clock.clock == "header" and clock.latency_s * 1e9 < -_EARLY_NS
     ]
@@ -531,26 +487,16 @@ def _join_time_bases(
             continue
         if clock.clock == "header":
             shift = round(away * 1e9)
-            apart = _format_offset(-away)
-            text = f"the stamps of {clock.topic} lie {apart} from the other topics' and were shifted"
+            values = {"kind": "stamps", "value": away}
         else:
             shift = round(-home * 1e9)
-            text = (
-                f"the recorder's clock lies {_format_offset(home)} from the stamps: "
-                f"{clock.topic}, which has none, was shifted"
-            )
+            values = {"kind": "log times", "value": away, "recorder_s": home}
         from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
 
         name = find_late_effect(Late.POSES).id
-        findings.append(Finding(name, "warning", text, where=clock.topic, value=away))
+        findings.append(Finding(name, "warning", clock.topic, values))
         joined[key] = replace(clock, stamp=clock.stamp + shift, findings=())
     return joined, findings
-
-
-def _format_offset(seconds: float) -> str:
-    if abs(seconds) * 1e9 > DAY_NS:
-        return "more than a day (another epoch)"
-    return format_duration(abs(seconds)) if abs(seconds) >= 1e3 else f"{seconds:.3g} s"  # noqa: PLR2004 - digits
 
 
 def drop_repeated_stamps(
@@ -579,11 +525,8 @@ def drop_repeated_stamps(
         inside = np.isin(clock.stamp // _BIN_NS, sorted(edges))
         single[key] = replace(clock, usable=clock.usable & ~inside)
     seconds = len(twice) * _BIN_NS / 1e9
-    text = (
-        f"for about {seconds:.2g} s all topics are twice as dense as usual: the recorder's clock was put "
-        "back, and both passes over that time were left out"
-    )
-    return single, [Finding("clock_jump", "warning", text, where="recorder", value=seconds, count=1)]
+    values = {"kind": "put back", "value": seconds, "count": 1}
+    return single, [Finding("clock_jump", "warning", "recorder", values)]
 
 
 def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:

@@ -78,8 +78,7 @@ def read_joints(
     findings: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(joint, velocity, position)]
     if missing:
-        text = f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated"
-        findings.append(Finding("velocity_from_position", "info", text, where=columns.topic))
+        findings.append(Finding("velocity_from_position", "info", columns.topic, {"joints": missing}))
     for joint in missing:
         if not _is_known(joint, position, velocity):
             raise _no_wheels(columns.topic, joints)
@@ -146,11 +145,8 @@ def _convert_unit(
     unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
     if section.unit is not None or not unit:
         return section, []
-    text = (
-        f"the velocities of {topic} are what its positions turn, in {unit}: they were converted "
-        '([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
-    )
-    return structs.replace(section, unit=unit), [Finding("unit_wrong", "warning", text, where=topic)]
+    finding = Finding("unit_wrong", "warning", topic, {"kind": "of positions", "unit": unit})
+    return structs.replace(section, unit=unit), [finding]
 
 
 def _mean_sideways(
@@ -534,11 +530,7 @@ def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Findi
     share = float(moved.mean())
     if share <= _FEW_REPEATS:
         return repeated, []
-    text = (
-        f"the encoders are read every {max(periods):.2g} s and each reading is repeated until the next one: "
-        "interpolated between readings"
-    )
-    return repeated, [Finding("held_wheels", "info", text, where="wheels", value=max(periods))]
+    return repeated, [Finding("held_wheels", "info", "wheels", {"value": max(periods)})]
 
 
 _LONGEST_REPEAT_S = 1.0

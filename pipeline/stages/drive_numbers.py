@@ -97,11 +97,9 @@ def mark_late_starts(
     if not at.size:
         return marked, []
     longest = float(steps.late[at].max())
-    text = (
-        f"in {at.size} of {np.count_nonzero(steps.is_first)} starts after a stop or gap the drive followed "
-        f"its first command late, by up to {longest:.2f} s: models apply these commands with this delay"
-    )
-    return marked, [Finding("late_start", "warning", text, where="command", value=longest, count=at.size)]
+    starts = int(np.count_nonzero(steps.is_first))
+    values = {"value": longest, "count": at.size, "starts": starts}
+    return marked, [Finding("late_start", "warning", "command", values)]
 
 
 def measure_responses(commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle) -> Responses:

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, format_share
+from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError
 from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -209,19 +209,18 @@ class Extraction:
         joined = join_channels(channels)
         count = len(channels)
         if joined is not None and len(types) > 1:
-            text = f"{topic} carries {len(types)} types, all read: {', '.join(types)}"
-            if len(types) == 2:  # noqa: PLR2004 - as one says it
-                text = f"{topic} carries two types, both read: {' and '.join(types)}"
-            if joined.header_time is None and any(one.header_time is not None for one in stamped):
-                text += "; one of them has no stamps: the times of recording are used"
-            self.findings.append(Finding("several_types", "warning", text, where=topic, count=len(types)))
+            lacks_stamps = joined.header_time is None and any(one.header_time is not None for one in stamped)
+            values = {"count": len(types), "types": types, "lacks_stamps": lacks_stamps}
+            self.findings.append(Finding("several_types", "warning", topic, values))
             return joined
         if joined is not None:
-            text = f"{topic} was recorded on {count} channels: their messages were put in one order"
-            self.findings.append(Finding("several_channels", "info", text, where=topic, count=count))
+            self.findings.append(
+                Finding("several_channels", "info", topic, {"kind": "joined", "count": count})
+            )
             return joined
-        text = f"{topic} was recorded on {count} channels of different types: the fullest was used"
-        self.findings.append(Finding("several_channels", "warning", text, where=topic, count=count))
+        self.findings.append(
+            Finding("several_channels", "warning", topic, {"kind": "fullest", "count": count})
+        )
         return max(channels, key=lambda columns: columns.log_time.size)
 
     def _list_types(self, channels: Sequence[TopicColumns]) -> list[str]:
@@ -232,13 +231,12 @@ class Extraction:
     def _report_left_out(self, columns: TopicColumns) -> Finding:
         """Messages of a topic that lack the fields that its other type has."""
         topic, count = columns.topic, columns.log_time.size
-        others = ", ".join(self._list_types([one for one in self.data.topics if one.topic == topic]))
-        text = f"{topic} carries two types: {count} messages of {columns.type_name}"
+        others = self._list_types([one for one in self.data.topics if one.topic == topic])
+        values = {"count": count, "type": columns.type_name, "others": others}
         if count:
             first, last = ((int(time) - self.data.index.start_ns) / 1e9 for time in columns.log_time[[0, -1]])
-            text += f", {first:.0f} to {last:.0f} s after the start of the log,"
-        text += f" are left out: they do not have what is read of {others}"
-        return Finding("type_left_out", "warning", text, where=topic, count=count)
+            values |= {"first_s": first, "last_s": last}
+        return Finding("type_left_out", "warning", topic, values)
 
     def _align(self) -> dict[str, TopicClock]:
         asked = self._asked_clocks()
@@ -300,11 +298,9 @@ class Extraction:
         late = int((np.diff(stamp) < 0).sum())
         twice = int((np.diff(np.sort(stamp)) == 0).sum())
         if late:
-            text = f"{late} messages of {topic} arrived out of order: sorted by their stamps"
-            self.findings.append(Finding("out_of_order", "info", text, where=topic, count=late))
+            self.findings.append(Finding("out_of_order", "info", topic, {"count": late}))
         if twice:
-            text = f"{twice} messages of {topic} share their stamp with another"
-            self.findings.append(Finding("duplicate_stamps", "warning", text, where=topic, count=twice))
+            self.findings.append(Finding("duplicate_stamps", "warning", topic, {"count": twice}))
         return usable[np.argsort(stamp, kind="stable")]
 
     @cached_property
@@ -320,11 +316,12 @@ class Extraction:
             asked = [section for section in sections if section.topic] or [_DEFAULT_SECTION]
             if ordered is not None:
                 columns, clock, order = ordered
-                states = reading.texts(columns, "data")
-                times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
+                texts = reading.texts(columns, "data")
+                times, said = self._seconds(clock.stamp[order]), [texts[i] for i in order.tolist()]
                 for section in asked:
                     spans += find_spans_of_state(times, said, section)
-            values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
+            states = [section.equals or DEFAULT_INTERVAL[1] for section in asked]
+            values = " or ".join(map(repr, states))
             if not spans:
                 said_so, lost = f"{source.topic} never says {values}", blame_damage(self.data.losses)
                 if lost:
@@ -332,10 +329,8 @@ class Extraction:
                 what = f"{said_so}, so that no command counts"
                 hint = "Set another `equals` in [[interval]], or take everything with --interval all."
                 raise StageError("no_interval", what, where=self.where, hint=hint)
-            text = f"only stretches in which {source.topic} says {values} were used ({len(spans)} of them)"
-            self.findings.append(
-                Finding("interval_applied", "info", text, where=source.topic, count=len(spans))
-            )
+            counted = {"count": len(spans), "states": states}
+            self.findings.append(Finding("interval_applied", "info", source.topic, counted))
         return spans
 
     def poses(self) -> pl.DataFrame:
@@ -347,12 +342,8 @@ class Extraction:
         times = self._seconds(stamp)
         position, quaternion, leant = reading.put_upright(arrays, self.configuration.pose)
         if leant:
-            text = (
-                f"the frame of the poses of {source.topic} leans by {np.degrees(leant):.0f} degrees, as that "
-                "of a camera, or of a sensor that is mounted upside down (ahead, right, down): it was turned "
-                "upright"
-            )
-            self.findings.append(Finding("body_upside_down", "warning", text, where=source.topic))
+            leaning = {"lean_deg": float(np.degrees(leant))}
+            self.findings.append(Finding("body_upside_down", "warning", source.topic, leaning))
         position, quaternion = self._lean(source, times, position, quaternion)
         recorded = (times, position, quaternion, breaks, self.configuration.velocity, source.topic)
         if self.cut is None or not self.cut.is_of(recorded):
@@ -386,16 +377,13 @@ class Extraction:
         if leaning is None:
             return position, quaternion
         position, quaternion, steepest, angle = leaning
-        text = (
-            f"the poses of {source.topic} know no slope: roll, pitch and height are by "
-            f"{imu.columns.topic}, up to {np.degrees(steepest):.0f} degrees"
-        )
-        if angle:
-            text += (
-                f"; by its accelerations it is mounted {abs(np.degrees(angle)):.0f} degrees to the "
-                f"{'left' if angle > 0.0 else 'right'} of ahead"
-            )
-        self.findings.append(Finding("slope_by_imu", "info", text, where="pose", value=steepest))
+        values = {
+            "value": steepest,
+            "topic": source.topic,
+            "imu": imu.columns.topic,
+            "mounted_rad": float(angle),
+        }
+        self.findings.append(Finding("slope_by_imu", "info", "pose", values))
         return position, quaternion
 
     def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
@@ -488,17 +476,12 @@ class Extraction:
             asked = self.configuration.pose.yaw_unit
             unit = asked or reading.find_angle_unit(columns, pose)
             if unit != (asked or pose.angle_unit):
-                text = (
-                    f"the headings of {source.topic} are in degrees: the body moves along them; converted, "
-                    'as yaw_unit = "deg" under [pose] in run.toml does; yaw_unit = "rad" takes them so'
-                )
-                self.findings.append(Finding("heading_unit", "warning", text, where=source.topic))
+                self.findings.append(Finding("heading_unit", "warning", source.topic))
             pose = msgspec.structs.replace(pose, angle_unit=unit)
         if pose is None or not pose.names:
             return reading.read_pose_topic(columns, pose)
         arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
-        text = f"of the bodies of {source.topic}, {name!r} is the vehicle"
-        self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
+        self.findings.append(Finding("body_chosen", "info", source.topic, {"body": name}))
         return arrays
 
     def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> reading.Located | None:
@@ -629,10 +612,7 @@ class Extraction:
         if section.late_s:
             stamp = stamp - round(section.late_s * 1e9)
         if not held and section.scale is not None:
-            text = f"the readings of the encoders are multiplied by {section.scale:g}, as configured"
-            self.findings.append(
-                Finding("encoder_scale_given", "info", text, where="wheels", value=section.scale)
-            )
+            self.findings.append(Finding("encoder_scale_given", "info", "wheels", {"value": section.scale}))
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
         names = [name for name in SIGNALS if held or not name.startswith("body")]
@@ -688,8 +668,7 @@ class Extraction:
         except SlipError as error:
             if source is None or section != DriveSection():
                 raise
-            text = f"{source} was taken for measured wheels by its type, but {error.what}: left out"
-            self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
+            self.findings.append(Finding("no_measured_wheels", "info", str(source), {"why": error.what}))
             return pl.DataFrame()
 
     def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, Ints]:
@@ -727,14 +706,13 @@ class Extraction:
         share = reading.asks_sideways(sideways)
         if share == 0.0:
             return []
-        text = (
-            f"{format_share(share)} of the commands of {topic} ask for sideways motion, which "
-            f"{self.vehicle.name} ({self.vehicle.kind}) cannot do, and that motion is left out: are its "
-            'wheels mecanum or omni wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in '
-            "run.toml, or --vehicle "
-            f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
-        )
-        return [Finding("sideways_command", "error", text, where=topic, value=share)]
+        values = {
+            "value": share,
+            "vehicle": self.vehicle.name,
+            "vehicle_kind": self.vehicle.kind,
+            "presets": [one.id for one in list_presets() if one.kinematics.has_inputs("sideways")],
+        }
+        return [Finding("sideways_command", "error", topic, values)]
 
     def _read_pair(
         self, source: DriveSource, section: DriveSection, *, held: bool

@@ -1,10 +1,9 @@
 """Findings of the stages, and the error of a log with too little data for one."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
-import polars as pl
+import msgspec
 
 from pipeline.core import SlipError
 from pipeline.logs import OVER_BUDGET, Loss
@@ -35,34 +34,34 @@ def blame_damage(losses: Sequence[Loss]) -> str:
 Severity = Literal["info", "warning", "error"]
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One finding.
+class Finding(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What was noticed of a run, by a stage or by the diagnosis; `pipeline.words.findings` has its sentence.
 
     Attributes:
         id: stable identifier in snake_case.
         severity: info, warning, or error: results of this run are not reliable.
-        text: one sentence.
         where: topic, column or channel; empty for the whole run.
+        values: numbers, texts and lists of the sentence by name, as JSON has them; ``value`` is the number
+            behind the finding, ``count`` how often it occurs, ``kind`` which of several sentences it is.
         t_start: start of the stretch concerned [s since the run's start].
         t_end: its end [s].
-        value: the underlying number, in the unit stated in the text.
-        count: number of occurrences.
     """
 
     id: str
     severity: Severity
-    text: str
     where: str = ""
+    values: Mapping[str, Any] = {}
     t_start: float | None = None
     t_end: float | None = None
-    value: float | None = None
-    count: int | None = None
 
+    @property
+    def value(self) -> float | None:
+        """The number behind it; None without one."""
+        value = self.values.get("value")
+        return float(value) if isinstance(value, int | float) else None
 
-def tabulate_findings(stage: str, findings: Sequence[Finding]) -> pl.DataFrame:
-    """Findings of one stage as a table (without the run's columns)."""
-    from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
-
-    rows = [{"stage": stage, **vars(finding)} for finding in findings]
-    return tabulate("findings", rows)
+    @property
+    def count(self) -> int | None:
+        """How often it occurs; None where that is not counted."""
+        count = self.values.get("count")
+        return count if isinstance(count, int) else None

@@ -31,11 +31,6 @@ _SMOOTH_S = 0.5
 _JOINED_S = 1.5
 """Largest gap [s] between events of one kind that are merged."""
 _KINDS = {1: "digging_in", 2: "spinning", 3: "sliding"}
-_MEANS = {
-    "digging_in": "the vehicle moved less and less per turn of its wheels: it dug in",
-    "spinning": "the wheels turned and the vehicle hardly moved: the wheels spun",
-    "sliding": "the vehicle moved faster than its wheels turned: it slid",
-}
 
 
 @dataclass(frozen=True)
@@ -89,8 +84,7 @@ def find_events(
         ends = (one.start, one.end, min(one.start + ANSWERS_S, one.end))
         rows.append(_make_row(velocities, one.kind, ends, None))
     findings = [
-        Finding(kind, "warning", _MEANS[kind], t_start=float(times[a]), t_end=float(times[b]))
-        for kind, a, b, _ in events
+        Finding(kind, "warning", t_start=float(times[a]), t_end=float(times[b])) for kind, a, b, _ in events
     ]
     rows.sort(key=lambda row: (row["t_start"], row["kind"]))
     return MotionEvents(tabulate("events", rows), tuple(findings))

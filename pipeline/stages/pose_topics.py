@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, Ints, format_share, name_first, rigid
+from pipeline.core import Flags, Floats, Ints, name_first, rigid
 from pipeline.logs import (
     TRANSFORM_TYPES,
     LogError,
@@ -170,12 +170,10 @@ def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags
     off = int((usable & (np.abs(length - 1.0) > _UNIT_FORGIVEN)).sum())
     findings = []
     if off:
-        text = f"{off} quaternions of {topic} were not of unit length: they were normalised"
-        findings.append(Finding("quaternion_not_unit", "warning", text, where=topic, count=off))
+        findings.append(Finding("quaternion_not_unit", "warning", topic, {"count": off}))
     bad = int((~usable).sum())
     if bad:
-        text = f"{bad} poses of {topic} have no orientation (a zero quaternion or not a number): left out"
-        findings.append(Finding("bad_quaternion", "warning", text, where=topic, count=bad))
+        findings.append(Finding("bad_quaternion", "warning", topic, {"count": bad}))
     return scaled, usable, findings
 
 
@@ -205,8 +203,7 @@ def cut_track(
     finite = np.isfinite(position).all(axis=1)
     lost = int((~finite & oriented).sum())
     if lost:
-        text = f"{lost} poses of {topic} are not numbers: left out"
-        findings.append(Finding("bad_pose", "warning", text, where=topic, count=lost))
+        findings.append(Finding("bad_pose", "warning", topic, {"count": lost}))
     valid = oriented & finite
     segment = np.zeros(times.size, dtype=np.int64)
     held = np.zeros(times.size, dtype=bool)
@@ -220,12 +217,7 @@ def cut_track(
     gaps = rigid.find_gaps(t, settings.gap_s)
     apart = _find_apart(t, p, q, gaps | clock, settings)
     if apart.any():
-        count = int(apart.sum())
-        text = (
-            f"{count} pose{'s' * (count > 1)} of {topic} lie{'s' * (count == 1)} far from those before and "
-            "after: left out"
-        )
-        findings.append(Finding("poses_apart", "warning", text, where=topic, count=count))
+        findings.append(Finding("poses_apart", "warning", topic, {"count": int(apart.sum())}))
         position, valid[good[apart]] = position.copy(), False
         position[good[apart]] = np.nan
         good, t, p, q = good[~apart], t[~apart], p[~apart], q[~apart]
@@ -306,36 +298,19 @@ def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str
     if gaps.any():
         lengths = np.diff(t)[gaps[1:]]
         count, longest = int(lengths.size), float(lengths.max())
-        gap = "1 gap" if count == 1 else f"{count} gaps"
-        text = f"{gap} in the poses of {topic}, the longest {longest:.3g} s: the run is split there"
-        findings.append(Finding("pose_gap", "info", text, where=topic, value=longest, count=count))
+        findings.append(Finding("pose_gap", "info", topic, {"value": longest, "count": count}))
     if jumps.any():
-        count = int(jumps.sum())
-        often = "once" if count == 1 else f"{count} times"
-        text = (
-            f"the pose of {topic} jumped {often} (the map was corrected, or a late "
-            "localization caught up): the run is split there"
-        )
         where = float(t[np.flatnonzero(jumps)[0]])
-        findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))
+        findings.append(Finding("pose_jump", "warning", topic, {"count": int(jumps.sum())}, t_start=where))
     fresh = rigid.select_fresh_poses(t, held)
     period = float(np.median(np.diff(t[fresh]))) if fresh.size > 1 else 0.0
     if period * SLOW_HZ > 1.0:
-        text = (
-            f"{topic} gives a new pose every {period:.2g} s: too slow for velocities, so that much driving "
-            "cannot be compared; record a faster localization, or the transforms (/tf): the odometry in them "
-            "fills the time between its poses"
-        )
-        findings.append(Finding("slow_poses", "warning", text, where=topic, value=period))
+        findings.append(Finding("slow_poses", "warning", topic, {"value": period}))
     # A vehicle at rest repeats its pose, too.
     share = 1.0 - fresh.size / held.size
     if share > 0.05:  # noqa: PLR2004 - fewer repeats are chance
-        text = (
-            f"{format_share(share)} of the poses of {topic} repeat the one before: the localization is slower"
-        )
-        findings.append(
-            Finding("held_poses", "info", text, where=topic, value=share, count=held.size - fresh.size)
-        )
+        values = {"value": share, "count": held.size - fresh.size}
+        findings.append(Finding("held_poses", "info", topic, values))
     return findings
 
 
@@ -445,38 +420,21 @@ def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
 def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
     """Findings on a chain."""
     topic = source.topic
-    text = f"poses are the transform from {series.parent} to {series.child}"
-    findings = [Finding("transforms", "info", text, where=topic)]
+    findings = [Finding("transforms", "info", topic, {"parent": series.parent, "child": series.child})]
     if source.frames is None and series.child.rsplit("/", 1)[-1] not in _BASES:
-        text = (
-            f"no frame is called base_link: {series.child}, the only one that moves"
-            f"{' in its namespace' * ('/' in series.child)}, is taken for the vehicle; "
-            "[pose] frames = [parent, child] names others"
-        )
-        findings.append(Finding("vehicle_frame", "info", text, where=topic))
+        findings.append(Finding("vehicle_frame", "info", topic, {"frame": series.child}))
     if series.parent.rsplit("/", 1)[-1] == "odom":
-        text = (
-            "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"
-        )
-        findings.append(Finding("pose_is_odometry", "warning", text, where=topic))
+        findings.append(Finding("pose_is_odometry", "warning", topic, {"kind": "transforms"}))
     if (often := rigid.measure_period(1e-9 * series.time[series.corrected].astype(np.float64))) > _SPARSE_S:
-        text = (
-            f"the localization corrects the odometry every {often:.2g} s (median): the poses between are the "
-            "odometry, with each correction spread along the path before it"
-        )
-        findings.append(Finding("sparse_corrections", "info", text, where=topic))
-    return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
+        findings.append(Finding("sparse_corrections", "info", topic, {"period_s": often}))
+    return findings + [Finding("transform_note", "info", topic, {"note": note}) for note in series.notes]
 
 
 def report_frame(topic: str, parent: str) -> list[Finding]:
     """Report poses that may be odometry, by their frame and the topic's name."""
     if parent.rsplit("/", 1)[-1] != "odom" or is_localization(topic):
         return []
-    text = (
-        f"{topic} gives poses in {parent}: they are an odometry, which drifts and may come from the wheels; "
-        "slip against the wheels themselves is zero"
-    )
-    return [Finding("pose_is_odometry", "warning", text, where=topic)]
+    return [Finding("pose_is_odometry", "warning", topic, {"kind": "topic", "parent": parent})]
 
 
 def to_base_link(
@@ -491,20 +449,15 @@ def to_base_link(
         return arrays, []
     base, offset = _find_base(topics, child)
     if offset is None:
-        text = (
-            f"{topic} gives poses of {child!r}, and no static transform leads from there to base_link: "
-            "they were taken as poses of base_link (a lever arm would look like lateral slip in turns)"
-        )
-        return arrays, [Finding("child_frame", "warning", text, where=topic)]
+        return arrays, [Finding("child_frame", "warning", topic, {"kind": "pose unplaced", "frame": child})]
     # Faults of an orientation are reported where the track is cut.
     unit, good, _ = normalize_quaternions(arrays.quaternion, topic)
     position, quaternion = arrays.position.copy(), arrays.quaternion.copy()
     position[good], quaternion[good] = move_to_base(
         arrays.position[good], unit[good], offset.position[0], offset.quaternion[0]
     )
-    text = f"{topic} gives poses of {child!r}: moved to base_link through the static transforms"
     moved = PoseArrays(position, quaternion, arrays.parent, base)
-    return moved, [Finding("child_frame", "info", text, where=topic)]
+    return moved, [Finding("child_frame", "info", topic, {"kind": "pose moved", "frame": child})]
 
 
 def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tuple[Floats, list[Finding]]:
@@ -517,16 +470,11 @@ def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tupl
     """
     _, offset = _find_base(topics, frame.lstrip("/"))
     if offset is None:
-        text = (
-            f"no static transform places the antenna of {topic} ({frame or 'no frame'}) on the vehicle: "
-            "it was taken to be at base_link (a lever arm would look like lateral slip in turns)"
-        )
-        return np.zeros(3), [Finding("child_frame", "warning", text, where=topic)]
+        values = {"kind": "antenna unplaced", "frame": frame}
+        return np.zeros(3), [Finding("child_frame", "warning", topic, values)]
     lever = -rigid.rotate(rigid.invert_quaternions(offset.quaternion), offset.position)[0]
-    text = (
-        f"{topic} is of an antenna {lever[0]:.2g} m ahead and {lever[1]:.2g} m left of base_link: moved there"
-    )
-    return lever, [Finding("child_frame", "info", text, where=topic)]
+    placed = {"kind": "antenna moved", "ahead_m": float(lever[0]), "left_m": float(lever[1])}
+    return lever, [Finding("child_frame", "info", topic, placed)]
 
 
 def find_turn(topics: Sequence[TopicColumns], frame: str) -> Floats | None:

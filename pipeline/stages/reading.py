@@ -58,10 +58,7 @@ def remove_absurd(topics: Sequence[TopicColumns]) -> tuple[tuple[TopicColumns, .
                 fields[name] = replace(column, values=good) if isinstance(column, Ragged) else good
         cleaned.append(replace(columns, fields=fields) if count else columns)
         if count:
-            text = (
-                f"{count} numbers of {columns.topic} are infinite or beyond 1e12: they count as not recorded"
-            )
-            findings.append(Finding("absurd_values", "warning", text, where=columns.topic, count=count))
+            findings.append(Finding("absurd_values", "warning", columns.topic, {"count": count}))
     return tuple(cleaned), findings
 
 

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Floats, Ints, arrays, format_share, rigid
+from pipeline.core import Flags, Floats, Ints, arrays, rigid
 from pipeline.run import MOVING_MPS, STILL_MPS, fit_turning
 from pipeline.sources import find_type
 from pipeline.stages import reading
@@ -217,15 +217,10 @@ def find_heading(
         middle = course.velocity - np.stack((swing.real, swing.imag), axis=-1)
         course = replace(course, velocity=middle)
     yaw = _put_on_course(times, turned, course)
-    text = (
-        f"the heading of {topic} is that of {turning.name}, aligned with the course over a minute: lateral "
-        "motion that lasts longer is not observable"
-    )
     silent = np.abs(turning.times[arrays.nearest_indices(times, turning.times)] - times) > arrays.SILENT_S
     yaw[silent] = np.nan
-    if silent.any():
-        text += f"; {format_share(silent.mean())} of the positions are left out, where it was silent"
-    return Heading(yaw, Finding("heading_from_imu", "info", text, where=topic, value=float(silent.mean())))
+    values = {"value": float(silent.mean()), "sensor": turning.name}
+    return Heading(yaw, Finding("heading_from_imu", "info", topic, values))
 
 
 def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] | None:
@@ -305,20 +300,8 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
             np.abs(near - times) < 1.5 * period, np.interp(times, clock, np.unwrap(angle[known])), np.nan
         )
     share = float(np.mean(~np.isfinite(yaw)))
-    text = (
-        f"the heading of {topic} is its course over ground, since no sensor that turns with it was recorded "
-        "or agrees: lateral slip is not observable and reads zero"
-    )
-    if course.window_s:
-        text += (
-            f", and turns are smoothed over {course.window_s:.2g} s, which makes those that change faster "
-            "look smaller"
-        )
-    if share:
-        text += (
-            f"; {format_share(share)} of the positions are left out, where the vehicle stands or turns about"
-        )
-    return Heading(yaw, Finding("heading_from_course", "warning", text, where=topic, value=share))
+    values = {"value": share, "window_s": course.window_s}
+    return Heading(yaw, Finding("heading_from_course", "warning", topic, values))
 
 
 _SEMI_MAJOR_M: Final = 6378137.0  # WGS 84
@@ -395,11 +378,9 @@ def locate_vehicle(
             course = follow_track(times, track.position, ahead)
             follow_alone = partial(follow_closely, course, track.position, ahead)
         if beside is not None and over_ground is None:
-            text = f"{beside.columns.topic} does not say how {topic} moves over ground: it was not used"
-            findings.append(Finding("velocity_disagrees", "warning", text, where=beside.columns.topic))
+            findings.append(Finding("velocity_disagrees", "warning", beside.columns.topic, {"topic": topic}))
     if ahead is None:
-        text = f"neither wheels nor commands show when the vehicle of {topic} reversed: forward is assumed"
-        findings.append(Finding("direction_assumed", "warning", text, where=topic))
+        findings.append(Finding("direction_assumed", "warning", topic))
     heading = find_heading(times, course, turnings, lever[:2], topic, follow_alone)
     headed = np.isfinite(heading.yaw)
     quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
@@ -435,8 +416,7 @@ def _read_track(receiver: Receiver) -> _Track:
     good, position = good[new], position[new]
     if not lost:
         return _Track(good, position)
-    text = f"{lost} messages of {columns.topic} are not a fix (a status below 0, or no place): left out"
-    finding = Finding("no_fix", "warning", text, where=columns.topic, count=lost)
+    finding = Finding("no_fix", "warning", columns.topic, {"count": lost})
     return _Track(good, position, findings=(finding,))
 
 
@@ -520,8 +500,7 @@ def head_positions(
     headed = np.isfinite(heading.yaw)
     if headed.sum() < FEWEST_MESSAGES:
         return None
-    text = f"the orientations of {topic} never turn, though its positions do: they are positions alone"
-    alone = Finding("no_heading", "warning", text, where=topic, count=int(arrays.position.shape[0]))
+    alone = Finding("no_heading", "warning", topic, {"count": int(arrays.position.shape[0])})
     quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
     made = PoseArrays(position[headed], quaternion, arrays.parent, arrays.child)
     return Located(rows[headed], made, (alone, heading.finding))

@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import Flags, Floats, format_duration
+from pipeline.core import Flags, Floats
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages.findings import Finding, StageError
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
@@ -182,12 +182,9 @@ def _report_stale(times: Floats, ideals: dict[str, Ideal], hold_s: float | None)
         return []
     count = int(lapsed.sum())
     seconds = count * float(np.median(np.diff(times))) if times.size > 1 else 0.0
-    text = (
-        f"for {format_duration(seconds)} no command had arrived within the last {hold_s:.2g} s "
-        "(command.hold_s): left out"
-    )
     first = float(times[np.flatnonzero(lapsed)[0]])
-    return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]
+    values = {"kind": "lapsed", "count": count, "seconds": seconds, "hold_s": hold_s}
+    return [Finding("stale_command", "warning", "command", values, t_start=first)]
 
 
 def report_across(drive: pl.DataFrame) -> list[Finding]:
@@ -197,12 +194,9 @@ def report_across(drive: pl.DataFrame) -> list[Finding]:
         return []
     stamps = drive["t"].to_numpy()
     seconds = across.size * float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
-    text = (
-        f"for {format_duration(seconds)} the steered wheel stands across, beyond 80 degrees: the speed of "
-        "the rear axle does not tell how fast the vehicle turns; left out"
-    )
     first = float(stamps[across[0]])
-    return [Finding("steered_across", "warning", text, where="wheels", t_start=first, count=across.size)]
+    values = {"count": across.size, "seconds": seconds}
+    return [Finding("steered_across", "warning", "wheels", values, t_start=first)]
 
 
 _ROUGHNESS_S = 1.0

@@ -21,7 +21,6 @@ from pipeline.core import (
     Floats,
     find_runs,
     find_scale,
-    format_share,
     list_likelihoods,
     number_stretches,
     recur,
@@ -37,16 +36,17 @@ Kind = Literal[
     "localization_frozen", "rotated", "lost",
 ]  # fmt: skip
 
-_MEANS: Mapping[str, str] = {
-    "emergency_stop": "the vehicle stood still under live commands: an emergency stop, or the drive was off",
-    "side_stopped": "the wheels of one side stood under live commands: one was stuck, or its motor off",
-    "manual_driving": "the vehicle moved without a command: by joystick, another controller, or a push",
-    "pushed": "the body moved while its wheels stood still: it was pushed or carried, or slid",
-    "commands_silent": "commands stopped arriving and the vehicle stopped: a watchdog, or a lost connection",
-    "stuck": "the wheels turned and the body did not move: it was stuck, dug in, or was lifted",
-    "localization_frozen": "the localization repeated one pose while the wheels turned: it was lost",
+_INCIDENTS = {
+    "emergency_stop",
+    "side_stopped",
+    "manual_driving",
+    "pushed",
+    "commands_silent",
+    "stuck",
+    "localization_frozen",
 }
-_BAD_POSES = {"rotated": "a rotated heading", "lost": "a motion that is not that of the wheels"}
+"""Kinds of spans that are no fault of the poses."""
+_BAD_POSES = ("rotated", "lost")
 
 BLOCK_S = 0.5
 """Length of a block [s]: an end of a span is known to within one."""
@@ -193,41 +193,34 @@ def find_spans(
     if rims.driven is not None:
         spans += _compare_wheels(rims, blocks, poses)
     spans.sort(key=lambda one: one.start)
-    incidents = tuple(one for one in spans if one.kind in _MEANS)
-    bad = [one for one in spans if one.kind not in _MEANS]
+    incidents = tuple(one for one in spans if one.kind in _INCIDENTS)
+    bad = [one for one in spans if one.kind not in _INCIDENTS]
     wrong = np.zeros(times.size, dtype=bool)
     for one in bad:
         wrong |= (times >= one.start) & (times <= one.end)
     if bad:
         findings.append(_report_poses(bad, wrong, rims))
+    about = {"commands_silent": "command", "localization_frozen": "pose"}
     findings += [
         Finding(
-            one.kind, "warning", f"{_MEANS[one.kind]}; left out of all fits",
-            where="command" if one.kind == "commands_silent"
-            else "pose" if one.kind == "localization_frozen" else "",
-            t_start=one.start, t_end=one.end, value=one.end - one.start,
+            one.kind,
+            "warning",
+            about.get(one.kind, ""),
+            {"value": one.end - one.start},
+            t_start=one.start,
+            t_end=one.end,
         )
         for one in incidents
-    ]  # fmt: skip
+    ]
     return Spans(wrong, mark_excluded(times, incidents), tuple(findings), incidents)
 
 
 def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
     driven = np.zeros(1) if rims.driven is None else np.abs(np.nan_to_num(rims.driven)).sum(axis=1)
     share = float(wrong.sum() / max(int((driven > LIVE_SHARE * rims.top).sum()), 1))
-    seconds = {
-        words: sum(one.end - one.start for one in bad if one.kind == kind)
-        for kind, words in _BAD_POSES.items()
-    }
-    kinds = {words: of for words, of in seconds.items() if of > 0.0}
-    shown = [words if len(kinds) == 1 else f"{words} ({of:.3g} s)" for words, of in kinds.items()]
-    text = (
-        f"{sum(seconds.values()):.3g} s of the poses ({format_share(share)} of the driving) have "
-        f"{' or '.join(shown)}: left out of medians and fits"
-    )
-    return Finding(
-        "bad_stretch", "warning", text, where="pose", t_start=bad[0].start, value=share, count=len(bad)
-    )
+    seconds = {kind: sum(one.end - one.start for one in bad if one.kind == kind) for kind in _BAD_POSES}
+    values = {"value": share, "count": len(bad), "seconds": seconds}
+    return Finding("bad_stretch", "warning", "pose", values, t_start=bad[0].start)
 
 
 def price_change(count: int) -> float:
@@ -502,26 +495,12 @@ def _compare_command(
         longest = max(end - start for start, end in pauses)
         inside = known & (np.abs(last).sum(axis=1) > 0.0)
         if longest > _LONG_PAUSE_S and _moves_otherwise(blocks, asked, last, target, known, inside):
-            text = (
-                f"in {len(pauses)} pauses of the command, of up to {longest:.1f} s, the vehicle moves "
-                "otherwise than by its last one: another topic or a remote control commands it there, and "
-                "these stretches are left out"
-            )
-            findings.append(
-                Finding(
-                    "commanded_otherwise", "warning", text, where="command", value=longest, count=len(pauses)
-                )
-            )
+            values = {"value": longest, "count": len(pauses)}
+            findings.append(Finding("commanded_otherwise", "warning", "command", values))
         elif keeps is not None and keeps.total - fit.total > blocks.price:
             fit, asked = keeps, asked + last
-            text = (
-                f"in {len(pauses)} pauses the vehicle continues its last command until the next, for up to "
-                f"{longest:.1f} s beyond command.hold_s: the base holds its last command; set "
-                "command.hold_s to the longest pause to include these stretches"
-            )
-            findings.append(
-                Finding("kept_command", "warning", text, where="command", value=longest, count=len(pauses))
-            )
+            values = {"value": longest, "count": len(pauses)}
+            findings.append(Finding("kept_command", "warning", "command", values))
         elif hold_s is not None:
             spans += _list_silent(rims, blocks, fit, asked + last, pauses, hold_s)
     has_sides = rims.driven is not None and vehicle.kinematics.has_inputs("left", "right")

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, format_share, rigid, student_quantile
+from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, rigid, student_quantile
 from pipeline.run import ANSWERS_S, LIVE_SHARE, MOVING_MPS, SPAN_S, STILL_MPS
 from pipeline.sources import Vehicle
 from pipeline.stages.findings import Finding
@@ -222,12 +222,8 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     if share is None or share > (_ROUNDING_ANY_WAY if is_driven else steps):
         return []
     elsewhere = turning is not None and turning > _ROUNDING
-    but = " but for their heading, which may be a gyro's" if elsewhere else ""
-    text = (
-        f"the poses follow the measured wheels to within rounding{but}: they are wheel odometry, "
-        "not a localization, and the slip is zero by construction: draw no conclusion from it"
-    )
-    return [Finding("pose_from_wheels", "error", text, where="pose", value=share)]
+    values = {"kind": "follows the wheels", "value": share, "has_other_heading": bool(elsewhere)}
+    return [Finding("pose_from_wheels", "error", "pose", values)]
 
 
 def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) -> bool:
@@ -347,12 +343,7 @@ def check_echo(
     share = float(repeats.mean())
     if share < _REPEATED:
         return []
-    text = (
-        f"the measured wheels repeat the commands ({format_share(share)} of their changes): a controller in "
-        "open loop reports what it was asked for, and nothing was measured. The run is evaluated from its "
-        "commands alone; record the encoders (/joint_states), or set open_loop: false in the controller"
-    )
-    return [Finding("wheels_from_commands", "warning", text, where="wheels", value=share)]
+    return [Finding("wheels_from_commands", "warning", "wheels", {"value": share})]
 
 
 def _keep_readings(table: pl.DataFrame, names: Sequence[str]) -> pl.DataFrame:
@@ -384,11 +375,8 @@ def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if count < FEWEST_SAMPLES:
         return []
     begin = float(samples.times[np.flatnonzero(past)[0]])
-    text = (
-        f"in {count} time steps the command is zero while the vehicle drives: the topic is stale, or the "
-        "vehicle is driven by other means (restrict the run with [[interval]], or use --input measured)"
-    )
-    return [Finding("stale_command", "warning", text, where="command", t_start=begin, count=count)]
+    values = {"kind": "zero", "count": count}
+    return [Finding("stale_command", "warning", "command", values, t_start=begin)]
 
 
 # A map that is scaled or sheared multiplies distances along heading h, to first order, by
@@ -443,14 +431,15 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if reached < needed or stretched < _LEAST:
         return []
     angle = math.degrees(0.5 * math.atan2(pair[1], pair[0])) % 180.0
-    low, high = (format_share(max(end, 0.0), 2) for end in (stretched - half, stretched + half))
-    text = (
-        f"by the wheels, distances in the map are {format_share(stretched, 2)} ({low} to {high}) longer "
-        f"along its heading of {angle:.0f} degrees than across: it is sheared or its axes have unequal "
-        "scales, or there is a slope that the poses do not show (a scale of the whole map cannot be "
-        "separated from the wheel radius)"
-    )
-    return [Finding("map_uneven", "warning", text, where="pose", value=stretched, count=int(first.size))]
+    low, high = (max(end, 0.0) for end in (stretched - half, stretched + half))
+    values = {
+        "value": stretched,
+        "count": int(first.size),
+        "low": low,
+        "high": high,
+        "heading_deg": angle,
+    }
+    return [Finding("map_uneven", "warning", "pose", values)]
 
 
 def _list_straight_spans(samples: Samples, measured: Floats) -> tuple[Ints, Ints]:

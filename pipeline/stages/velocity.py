@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import Floats, arrays, format_share, rigid
+from pipeline.core import Floats, arrays, rigid
 from pipeline.run import (
     SPAN_S,
     Alignment,
@@ -91,29 +91,20 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     fit = alignment.gyro
     if fit is None:
         if float(np.std(turning)) < _LEAST_TURNING_RADPS:
-            text = "the vehicle turned too little to check the gyro against the poses: it was not used"
-            return [Finding("imu_unchecked", "info", text)]
-        text = "the gyro does not agree with the poses, or is silent in part of the run: it was not used"
-        return [Finding("imu_disagrees", "warning", text, where="imu")]
+            return [Finding("imu_unchecked", "info")]
+        return [Finding("imu_disagrees", "warning", "imu")]
     findings = []
     if fit.signed_scale < 0.0:
-        text = (
-            "the gyro's yaw rate has the wrong sign and was inverted: it then differs from the yaw rate of "
-            f"the poses by {format_share(fit.residual)}"
-        )
-        findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.signed_scale))
+        values = {"value": fit.signed_scale, "residual": fit.residual}
+        findings.append(Finding("imu_sign", "warning", "imu", values))
     scale = abs(fit.signed_scale)
     if abs(scale - 1.0) > _SCALE_FORGIVEN:
-        text = f"the poses turn {scale:.3f} times as much as the gyro says: it was scaled"
-        findings.append(Finding("imu_scale", "warning", text, where="imu", value=scale))
+        findings.append(Finding("imu_scale", "warning", "imu", {"value": scale}))
     if abs(fit.bias) > _BIAS_FORGIVEN:
-        text = f"the gyro has a bias of {-fit.bias:.4f} rad/s against the poses: it was removed"
-        findings.append(Finding("imu_bias", "info", text, where="imu", value=-fit.bias))
+        findings.append(Finding("imu_bias", "info", "imu", {"value": -fit.bias}))
     delay = alignment.heading_delay_s
     if abs(delay) > _LATE:
-        late = "late" if delay > 0.0 else "early"
-        text = f"the poses are {abs(delay):.2g} s {late} against the gyro: corrected"
-        findings.append(Finding("pose_delay", "info", text, where="pose", value=delay))
+        findings.append(Finding("pose_delay", "info", "pose", {"value": delay}))
     return findings
 
 
@@ -150,9 +141,7 @@ def compute_velocities(
     table, skipped = differentiate_poses(poses, settings, wheels, where=where)
     findings: list[Finding] = []
     if skipped:
-        are, hold = ("segment is", "holds") if skipped == 1 else ("segments are", "hold")
-        text = f"{skipped} {are} shorter than {SPAN_S} s or {hold} one pose: left out"
-        findings.append(Finding("short_segments", "info", text, count=skipped))
+        findings.append(Finding("short_segments", "info", "", {"count": skipped, "span_s": SPAN_S}))
     gyro = alignment.gyro
     if not imu.is_empty():
         findings += report_gyro(alignment, table["v_w"].to_numpy())
@@ -169,8 +158,7 @@ def compute_velocities(
             raise StageError("no_gyro", what, where=where, hint="Use --yaw pose (the default).")
         silent = table["v_w_imu"].null_count()
         if silent:
-            text = f"the gyro is silent in {silent} time steps: the poses' yaw rate is used there"
-            findings.append(Finding("imu_gap", "warning", text, where="imu", count=silent))
+            findings.append(Finding("imu_gap", "warning", "imu", {"count": silent}))
         table = table.with_columns(pl.coalesce(pl.col("v_w_imu"), pl.col("v_w")).alias("v_w"))
     return VelocityResult(table, tuple(findings))
 

@@ -103,6 +103,7 @@ class _Finding(msgspec.Struct):
     t_end: Number
     value: Number
     count: int | None
+    values: dict[str, object] = {}
 
 
 class _Source(msgspec.Struct):

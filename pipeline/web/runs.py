@@ -2,19 +2,15 @@
 
 import msgspec
 
+from pipeline.core import pick
 from pipeline.results import find_refusal, read_findings
 from pipeline.store import MANIFEST, REPORT, Manifest, Store, StoreError, read_stored
 from pipeline.web import WorkbenchError
+from pipeline.words import format_finding
 
 
 class _Loss(msgspec.Struct):
     kind: str = ""
-    text: str = ""
-
-
-class _Finding(msgspec.Struct):
-    id: str = ""
-    severity: str = ""
     text: str = ""
 
 
@@ -37,7 +33,7 @@ class _Summary(msgspec.Struct):
     distance_m: float | None = None
     leading_input: str | None = None
     verdict: str | None = None
-    findings: list[_Finding] = []
+    findings: list[dict[str, object]] = []
     log: _Log = msgspec.field(default_factory=_Log)
 
 
@@ -48,12 +44,15 @@ def summarize_run(manifest: Manifest) -> dict[str, object]:
     except StoreError:
         summary = _Summary()
     content = msgspec.to_builtins(summary)
+    findings = read_findings(content)
+    refusal = find_refusal(findings)
     return {
         **content,
         **content.pop("log"),
+        "findings": [{**pick(one, "id", "severity"), "text": format_finding(one)} for one in findings],
         "run": manifest.run,
         "analyzed_s": (manifest.folder.parent / MANIFEST).stat().st_mtime,
-        "refusal": find_refusal(read_findings(content)),
+        "refusal": "" if refusal is None else format_finding(refusal),
         "report": REPORT in manifest.files,
     }
 

@@ -1,7 +1,8 @@
 """Sentences: results as text, the same for screen, report, workbench, JSON and notebook.
 
 `verdict` says how far a run is off in one to three sentences, `diagnosis` lists its lines, `effects` and
-`errors` have the parts, and `objects` adds the sentences to the JSON of `slip diagnose`.
+`errors` have the parts, `findings` has a template an id, and `objects` adds the sentences to the JSON of
+`slip diagnose`.
 """
 
 from typing import TYPE_CHECKING
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
         format_remaining_error,
         name_span,
     )
+    from pipeline.words.findings import format_finding
     from pipeline.words.models import (
         describe_step,
         format_contest,

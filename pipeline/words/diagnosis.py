@@ -25,7 +25,6 @@ from pipeline.results import (
     ERRORS_OVER_2S,
     SEARCH_CUT,
     Errors,
-    Finding,
     Named,
     RunDiagnosis,
     Step,
@@ -34,12 +33,14 @@ from pipeline.results import (
     Value,
     format_rises,
     is_small,
+    key_finding,
     list_added,
     measure_excess,
     split_determined,
     split_main,
 )
 from pipeline.run import HORIZON_S
+from pipeline.stages import Finding, Severity
 from pipeline.words.effects import (
     describe_cause,
     describe_motion,
@@ -61,6 +62,7 @@ from pipeline.words.errors import (
     format_remaining_error,
     format_step,
 )
+from pipeline.words.findings import format_finding
 from pipeline.words.verdict import format_verdict
 
 Row = tuple[str, str]
@@ -537,7 +539,7 @@ def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everyt
         verdict: on them.
         everything: also notes, and more than three.
     """
-    by_kind: dict[tuple[str, str, str | None], dict[str, list[str]]] = {}
+    by_kind: dict[tuple[Severity, str, str], dict[str, list[str]]] = {}
     for run, findings in runs.items():
         for severity, one, text in _join_incidents(findings):
             if text.casefold() not in verdict.casefold():
@@ -569,7 +571,7 @@ def _format_of_runs(by_text: Mapping[str, Sequence[str]], asked: int) -> str:
     return f"{count} runs{'' if len(by_text) == 1 else f', as in {first}'}: {text}"
 
 
-def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, Finding, str]]:
+def _join_incidents(findings: Sequence[Finding]) -> list[tuple[Severity, Finding, str]]:
     """Severity, first and text of every finding: incidents of one kind are one, and so are repeated ones."""
     incidents = group_by(
         (one.id, one)
@@ -578,10 +580,11 @@ def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, Finding, str
     )
     timed = [(alike[0].severity, alike[0], _format_timed(alike)) for alike in incidents.values()]
     joined = {one for alike in incidents.values() for one in map(id, alike)}
-    plain = group_by(((one.severity, one.text), one) for one in findings if id(one) not in joined)
+    plain = group_by(((one.severity, key_finding(one)), one) for one in findings if id(one) not in joined)
     return timed + [
-        (severity, alike[0], f"{text} ({len(alike)} times)" if len(alike) > 1 else text)
-        for (severity, text), alike in plain.items()
+        (alike[0].severity, alike[0], format_finding(alike[0]) + times)
+        for alike in plain.values()
+        for times in [f" ({len(alike)} times)" if len(alike) > 1 else ""]
     ]
 
 
@@ -589,4 +592,4 @@ def _format_timed(alike: Sequence[Finding]) -> str:
     """Number of incidents of one kind, and the longest of them."""
     longest = max(alike, key=lambda one: (one.t_end or 0.0) - (one.t_start or 0.0))
     many = f"{len(alike)} incidents, the longest " if len(alike) > 1 else ""
-    return f"{many}from {longest.t_start:.1f} to {longest.t_end:.1f} s: {longest.text}"
+    return f"{many}from {longest.t_start:.1f} to {longest.t_end:.1f} s: {format_finding(longest)}"

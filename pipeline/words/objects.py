@@ -20,6 +20,7 @@ from pipeline.words.errors import (
     name_region,
     name_span,
 )
+from pipeline.words.findings import format_finding
 from pipeline.words.verdict import format_verdict
 
 
@@ -32,6 +33,12 @@ def diagnosis_as_json(run: RunDiagnosis) -> dict[str, Any]:
         entry["manoeuvre"] = suggest_drive(name)
     if run.unexplained is not None:
         content["unexplained"]["where"] = describe_structure(run.unexplained)
+    content["findings"] = [
+        {"id": one.id, "text": format_finding(one), "where": one.where, "severity": one.severity}
+        | {name: entry["values"][name] for name in ("value", "count") if name in one.values}
+        | entry
+        for one, entry in zip(run.findings, content["findings"], strict=True)
+    ]
     for region, entry in zip(run.where, content["where"], strict=True):
         entry["region"], entry["text"] = name_region(region), describe_region(region)
     for moments, entry in zip(run.when, content["when"], strict=True):

@@ -11,7 +11,6 @@ from pipeline.results import (
     CHANGE,
     ERRORS_OVER_2S,
     SEARCH_CUT,
-    Finding,
     RunDiagnosis,
     Step,
     find_refusal,
@@ -21,8 +20,10 @@ from pipeline.results import (
     rank_main,
 )
 from pipeline.run import HORIZON_S
+from pipeline.stages import Finding
 from pipeline.words.effects import describe_clause, list_names, name_group
 from pipeline.words.errors import format_excess, format_step
+from pipeline.words.findings import format_finding
 
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
@@ -40,7 +41,7 @@ _LONGEST = 400
 def format_refusal(findings: Iterable[Finding]) -> str:
     """The verdict on a run that was not diagnosed: what forbids a fit; empty where nothing does."""
     refusal = find_refusal(findings)
-    return _join(refusal, "No effect can be estimated") if refusal else ""
+    return _join(format_finding(refusal), "No effect can be estimated") if refusal else ""
 
 
 def format_verdict(run: RunDiagnosis) -> str:
@@ -53,7 +54,7 @@ def format_verdict(run: RunDiagnosis) -> str:
         return refusal
     ladder = run.ladder
     if not ladder:
-        why = (one.text.rstrip(".") for one in run.findings if one.where == "diagnosis")
+        why = (format_finding(one).rstrip(".") for one in run.findings if one.where == "diagnosis")
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
     opening = f"Over {HORIZON_S:g} s the ideal model is {format_step(ladder[0])} off"
     scope = [NO_GROUND] if has_no_pose(run.findings) else []
@@ -88,7 +89,7 @@ def _list_commanded(run: RunDiagnosis) -> list[str]:
 
 def _list_open_ends(run: RunDiagnosis) -> tuple[str, str, str]:
     """What the log does not decide, what changes during it, and why error remains, as clauses."""
-    noted = {one.id: one.text for one in run.findings}
+    noted = {one.id: one for one in run.findings}
     why = ""
     if BREVITY in noted:
         why = "the run is too short for certainty"
@@ -96,7 +97,8 @@ def _list_open_ends(run: RunDiagnosis) -> tuple[str, str, str]:
         why = "the budget ended the search for effects early"
     elif CHANGE not in noted and measure_excess(run) >= ABOVE_FLOOR:
         why = _UNKNOWN
-    return _describe_choice(run), noted.get(CHANGE, ""), why
+    change = noted.get(CHANGE)
+    return _describe_choice(run), "" if change is None else format_finding(change), why
 
 
 def _format_nothing(run: RunDiagnosis) -> list[str]:

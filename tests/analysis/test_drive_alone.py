@@ -29,6 +29,7 @@ from pipeline.simulate.facts import find_layout
 from pipeline.simulate.messages import list_topics
 from pipeline.sources import find_preset
 from pipeline.store import Manifest, Store
+from pipeline.words import format_finding
 from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import NO_GROUND
 
@@ -169,7 +170,9 @@ def test_runs_with_and_without_a_pose_are_not_judged_together(unknown: Analyzed,
     judged, left_out = diagnose_runs(both, vehicle, inputs=("command",)).runs
     assert (judged.run, judged.joint, bool(judged.ladder)) == ("whole", ("whole",), True)
     assert (left_out.run, left_out.ladder) == ("alone", ())
-    assert "left out: the log holds no pose, so that only its drivetrain" in left_out.findings[0].text
+    assert "left out: the log holds no pose, so that only its drivetrain" in format_finding(
+        left_out.findings[0]
+    )
     alone, other = (load_recording(one, vehicle) for one in both)
     ground = [effect for name in ("effective_track", "drive_lag") if (effect := find_effect(name))]
     effects = [effect() for effect in ground]

@@ -15,6 +15,7 @@ from pipeline.recording.inspection import inspect_log
 from pipeline.recording.log_choice import MOST_POSES
 from pipeline.simulate import simulate_case
 from pipeline.stages import pose_choice
+from pipeline.words import format_finding
 
 FEW = 150
 """Topics of a kind beside those of a drive."""
@@ -108,4 +109,7 @@ def test_of_many_poses_those_with_most_messages_are_compared_and_the_others_coun
     assert str(choice.sources.pose) == str(inspect_log(drive, OPTIONS).choice.sources.pose)  # type: ignore[union-attr]
     (finding,) = [one for one in choice.findings if one.id == "poses_left_out"]
     assert finding.count == FEW + 1 - MOST_POSES
-    assert finding.text == f"{FEW + 1} topics or frames hold poses: the 40 with most messages were compared"
+    assert (
+        format_finding(finding)
+        == f"{FEW + 1} topics or frames hold poses: the 40 with most messages were compared"
+    )

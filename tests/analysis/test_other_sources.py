@@ -21,6 +21,7 @@ from pipeline.recording.log_choice import Choice, choose
 from pipeline.simulate.facts import Published, Q
 from pipeline.simulate.messages import Fields, imu, joints, odometry, twist
 from pipeline.sources import load_configuration
+from pipeline.words import format_finding
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 WHEEL = "{}_wheel_joint"
@@ -204,7 +205,7 @@ def test_a_body_command_and_its_wheels_tell_the_controllers_geometry(
     assert chosen.vehicle_source == "fitted"
     assert chosen.vehicle.track_width_m == pytest.approx(0.555, rel=0.02)
     assert chosen.vehicle.wheel_radius_m == pytest.approx(0.1651, rel=0.02)
-    assert "its controller turns commands" in " ".join(finding.text for finding in chosen.findings)
+    assert "its controller turns commands" in " ".join(format_finding(finding) for finding in chosen.findings)
 
 
 PARAMETERS = {

@@ -12,6 +12,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.sources import load_configuration
+from pipeline.words import format_finding
 
 VESC = "/sensors/core.state.speed, /sensors/servo_position_command.data"
 AUTOWARE = (
@@ -196,7 +197,7 @@ def test_a_turtlebot_that_does_not_say_so_is_recognized_by_its_geometry(foreign_
     assert chosen.vehicle_source == "fitted"
     assert chosen.vehicle.wheel_radius_m == pytest.approx(0.033, rel=0.03)
     assert chosen.vehicle.track_width_m == pytest.approx(0.287, rel=0.03)
-    said = " ".join(finding.text for finding in chosen.findings)
+    said = " ".join(format_finding(finding) for finding in chosen.findings)
     assert "turtlebot3_waffle" in said
     assert "wheel odometry, not a localization" in said
 

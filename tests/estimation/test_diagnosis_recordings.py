@@ -25,6 +25,7 @@ from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, Timing, find_effect
 from pipeline.results import RunDiagnosis
 from pipeline.results.reading import read_model
+from pipeline.words import format_finding
 from pipeline.words.verdict import format_verdict
 
 if TYPE_CHECKING:
@@ -237,5 +238,5 @@ def test_a_crab_angle_is_told_and_a_track_has_no_clock_for_a_rival(asked: Asked)
     """On tile the poses drift sideways by .025 of the way, forward and backward; a clock promises more."""
     run = asked.diagnose("husky_wheels-deflated_tile_2023_12_12_16h16", "measured")
     (told,) = (finding for finding in run.findings if finding.id == "pose_angle")
-    assert "heading_deg = 1.6 under [pose]" in told.text
+    assert "heading_deg = 1.6 under [pose]" in format_finding(told)
     assert not any("effective_track" in group.candidates for group in run.undecided)

@@ -13,6 +13,7 @@ from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.results import RunDiagnosis
 from pipeline.simulate import make_scenario, simulate_run, write_log
+from pipeline.words import format_finding
 
 
 def judge(folder: Path, effects: dict[str, float], reads: float, configured: str = "") -> RunDiagnosis:
@@ -50,8 +51,8 @@ def test_encoders_that_misread_are_named_with_the_line_that_mends_them(reads: fl
     assert track.parameters["k"].value == pytest.approx(1.3, rel=0.01)
     (found,) = (one for one in judged.findings if one.id == "encoder_scale")
     assert found.value == pytest.approx(reads, rel=2e-3)
-    assert f"{'5 % low' if reads < 1.0 else '8 % high'}" in found.text
-    line = found.text.split("; ")[1].split(" under")[0]
+    assert f"{'5 % low' if reads < 1.0 else '8 % high'}" in format_finding(found)
+    line = format_finding(found).split("; ")[1].split(" under")[0]
     mended = judge(tmp_path, {"effective_track": 1.3}, reads, f"[wheels]\n{line}\n")
     assert list_ids(mended) == {"drive_lag", "effective_track"}
     assert "encoder_scale" not in {one.id for one in mended.findings}
@@ -74,7 +75,7 @@ def test_a_coincidence_is_said_and_can_be_claimed(tmp_path: Path) -> None:
     judged = judge(tmp_path, effects, 1.0)
     (found,) = (one for one in judged.findings if one.id == "encoder_scale")
     assert found.value == pytest.approx(0.95, rel=2e-3)
-    assert "another radius and the drive has that gain by coincidence, scale = 1" in found.text
+    assert "another radius and the drive has that gain by coincidence, scale = 1" in format_finding(found)
     claimed = judge(tmp_path, effects, 1.0, "[wheels]\nscale = 1\n")
     assert list_ids(claimed) == {"drive_lag", "wheel_radius", "drive_gain"}
     assert "encoder_scale" not in {one.id for one in claimed.findings}

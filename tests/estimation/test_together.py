@@ -19,6 +19,7 @@ from pipeline.results import RunDiagnosis
 from pipeline.run import MotionError
 from pipeline.simulate import VEHICLES, Disturbance, Scenario, simulate_run, write_log
 from pipeline.sources import find_preset
+from pipeline.words import format_finding
 
 
 def _draw(name: str, gain: float, *findings: tuple[str, float | None]) -> Recording:
@@ -47,7 +48,7 @@ def _draw(name: str, gain: float, *findings: tuple[str, float | None]) -> Record
         ("wheel_delay", "latency_spread", "outlier_time", "heading_delay", "hold_time"), 0.0
     ) | dict.fromkeys(("command_scale", "track_multiplier"), 1.0)
     found = [
-        {"id": one, "text": f"{one} of {name}", "where": "", "severity": "error", "value": value}
+        {"id": one, "where": "", "severity": "error", "values": json.dumps({"value": value})}
         for one, value in findings
     ]
     tables = {
@@ -78,7 +79,7 @@ def test_a_run_that_cannot_be_judged_is_left_out_with_its_reason() -> None:
     runs = [_draw("one", 0.9), _draw("late", 0.9), _draw("other", 0.9, ("pose_from_wheels", None))]
     judged = judge_together(runs, HUSKY, "measured", _judge).runs
     assert [one.run for one in judged] == ["one", "other", "late"]
-    assert judged[2].findings[0].text == "left out: the run has 3 stretches"
+    assert format_finding(judged[2].findings[0]) == "left out: the run has 3 stretches"
     # The error of a single run is its own.
     with pytest.raises(MotionError, match="3 stretches"):
         judge_together(runs[1:2], HUSKY, "measured", _judge)
@@ -91,7 +92,7 @@ def test_a_wrong_radius_is_slippery_ground_where_other_runs_contradict_it() -> N
     runs = [_draw("ice", 0.34, claim), _draw("road", 0.85)]
     (ice, _) = judge_together(runs, HUSKY, "measured", _judge).runs
     assert [(one.id, one.severity) for one in ice.findings] == [("slippery_ground", "info")]
-    assert ice.findings[0].text.startswith("the vehicle covers 34 % of the distance of its wheels")
+    assert format_finding(ice.findings[0]).startswith("the vehicle covers 34 % of the distance of its wheels")
     # Runs that agree with the radius that it implies leave it a wrong radius.
     alike = [_draw("one", 0.34, claim), _draw("other", 0.34, claim)]
     for run in judge_together(alike, HUSKY, "measured", _judge).runs:

@@ -20,7 +20,6 @@ from pipeline.results import (
     Delays,
     Detectable,
     Errors,
-    Finding,
     Interval,
     Named,
     RunDiagnosis,
@@ -29,6 +28,7 @@ from pipeline.results import (
     Value,
 )
 from pipeline.sources import list_presets
+from pipeline.stages import Finding
 from pipeline.words.diagnosis import list_lines
 from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import format_verdict
@@ -39,7 +39,14 @@ if TYPE_CHECKING:
     Check = Callable[[str, str], None]
 
 PRESETS = {vehicle.id: vehicle for vehicle in list_presets()}
-SHORT = [{"id": "little_driving", "text": "the run has 31 s of driving", "where": "diagnosis"}]
+SHORT = [
+    {
+        "id": "little_driving",
+        "severity": "warning",
+        "where": "diagnosis",
+        "values": {"error": "the run has 31 s of driving"},
+    }
+]
 POOR = "run: 9 s of driving. Drive longer."
 TRACK, LAG, ASYMMETRY = {"k": 1.5}, {"tau": 0.3}, {"e": 0.02}
 CLOSE, FAR = [(0.055, 0.02)], [(0.4, 0.2)]
@@ -80,7 +87,9 @@ DRAWN = {
     "two rivals": draw_diagnosis({}, FAR, undecided=[{"candidates": RIVALS[2:4], "in_model": None}]),
     "five rivals": draw_diagnosis({}, FAR, undecided=[{"candidates": RIVALS, "in_model": None}]),
     "a clock alone": draw_diagnosis({"clock_offset": {"d": -0.15}}, CLOSE),
-    "too poor": RunDiagnosis("run", findings=(Finding("too_short", POOR, "diagnosis"),)),
+    "too poor": RunDiagnosis(
+        "run", findings=(Finding("too_short", "warning", "diagnosis", {"error": POOR}),)
+    ),
 }
 UNUSUAL = {"five rivals", "nothing, and no floor", "too poor"}
 """Those with a number that counts something, or without a rung or a floor."""
@@ -105,7 +114,7 @@ def test_verdicts(check_golden: Check) -> None:
         name: (format_verdict if name in UNUSUAL else check_verdict)(drawn) for name, drawn in DRAWN.items()
     }
     for name in ("not_moving", "pose_from_wheels", *FAULTS):
-        finding = Finding(name, "the reason in words", severity="error")
+        finding = Finding(name, "error", values={"error": "the reason in words"})
         told[f"refused: {name}"] = format_verdict(replace(DRAWN["two effects"], findings=(finding,)))
     check_golden("verdicts.txt", "\n\n".join(f"{name}:\n{verdict}" for name, verdict in told.items()))
 
@@ -143,9 +152,12 @@ def test_lines_of_a_diagnosis(check_golden: Check) -> None:
             0.3601, 0.3597, 0.3605, "s/m", another_run=Interval(0.277, 0.443), is_spread_measured=True
         ),
     }
-    stuck = Finding("stuck", "it was stuck", severity="warning")
-    many = [Finding("w", f"warning {number}", severity="warning") for number in range(5)]
-    grave, note = Finding("e", "an error", severity="error"), Finding("n", "a note", severity="info")
+    stuck = Finding("stuck", "warning", values={"error": "it was stuck"})
+    many = [Finding("w", "warning", values={"error": f"warning {number}"}) for number in range(5)]
+    grave, note = (
+        Finding(one, severity, values={"error": text})  # type: ignore[arg-type]
+        for one, severity, text in (("e", "error", "an error"), ("n", "info", "a note"))
+    )
     names = ["wheel_servo", "torque_limit", "drive_lag"]
     formula = 'v_y = "k_1 * v0 * v0"\nk_1 = { value = 0.08188, unit = "s/m", bounds = [-50.0, 50.0] }\n'
     run = RunDiagnosis(
@@ -200,7 +212,7 @@ def test_lines_of_a_diagnosis(check_golden: Check) -> None:
 )
 def test_page_of_a_run(kind: str, check_golden: Check) -> None:
     whole = make_report(measured=kind != "commands_alone")
-    grave = {"id": "not_moving", "severity": "error", "text": "the vehicle does not move", "where": ""}
+    grave = {"id": "not_moving", "severity": "error", "values": {"error": "the vehicle does not move"}}
     report = {
         "undiagnosed": lambda: RunReport(whole.summary, whole.tables),
         "undecided": lambda: RunReport(whole.summary, {}, replace(whole.diagnosis, effects=())),

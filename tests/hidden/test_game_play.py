@@ -41,6 +41,7 @@ from pipeline.core.rigid import rotate
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.simulate import EffectSpec, State, list_effects, simulate_run
+from pipeline.words import format_finding
 
 pytestmark = pytest.mark.long
 
@@ -365,7 +366,7 @@ def test_a_heading_skew_that_no_prediction_shows_is_a_finding_and_no_name(tmp_pa
     vehicle, recording = read_recording(manifest)
     (run,) = diagnose_runs([recording], vehicle).runs
     assert {effect.id for effect in run.effects} == {"deadband", "effective_track", "icr_offset"}
-    (said,) = [one.text for one in run.findings if one.id == "idle_effect"]
+    (said,) = [format_finding(one) for one in run.findings if one.id == "idle_effect"]
     assert str(said).startswith("heading_skew reduces the error over half a second, but not ")
 
 

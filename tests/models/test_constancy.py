@@ -15,6 +15,7 @@ from pipeline.results import Errors, RunDiagnosis, Step
 from pipeline.results.reading import CHANGE
 from pipeline.run import load_run
 from pipeline.simulate import simulate_run
+from pipeline.words import format_finding
 from pipeline.words.verdict import format_verdict
 
 HUSKY = vehicle_of("husky_a200")
@@ -59,12 +60,14 @@ def test_a_number_that_changes_is_found_with_its_time(
 ) -> None:
     findings = find_change(judge(({name: {number: before}}, {name: {number: after}}), 40, lengths_s))
     (finding,) = findings
-    assert (finding.id, finding.where, finding.parameter) == (CHANGE, name, number)
-    assert finding.time == pytest.approx(lengths_s[0] + 0.5 * PAUSE_S, abs=8.0)
-    assert finding.before == pytest.approx(before, rel=0.05)
-    assert finding.after == pytest.approx(after, rel=0.05)
+    assert (finding.id, finding.where, finding.values["parameter"]) == (CHANGE, name, number)
+    assert finding.values["time"] == pytest.approx(lengths_s[0] + 0.5 * PAUSE_S, abs=8.0)
+    assert finding.values["before"] == pytest.approx(before, rel=0.05)
+    assert finding.values["after"] == pytest.approx(after, rel=0.05)
     # Both values have the digits that tell them apart.
-    said = [float(text) for text in re.findall(r" is ([\d.]+)\D* before and ([\d.]+)", str(finding.text))[0]]
+    said = [
+        float(text) for text in re.findall(r" is ([\d.]+)\D* before and ([\d.]+)", format_finding(finding))[0]
+    ]
     assert said[1] - said[0] == pytest.approx(after - before, rel=0.2)
     steps = (
         Step(t_mrmse_m=0.2, r_mrmse_rad=0.1),
@@ -72,7 +75,7 @@ def test_a_number_that_changes_is_found_with_its_time(
     )
     floor = Errors(t_mrmse_m=0.01, r_mrmse_rad=0.01)
     verdict = format_verdict(RunDiagnosis("run", ladder=steps, noise_floor=floor, findings=tuple(findings)))
-    assert str(finding.text)[1:] in verdict
+    assert format_finding(finding)[1:] in verdict
     assert "No known effect" not in verdict
 
 
@@ -81,8 +84,8 @@ def test_what_changes_beside_a_number_is_said() -> None:
         {"effective_track": {"k": k}, "wheel_radius": {"k": r}} for k, r in ((1.3, 1.0), (1.7, 0.9))
     )
     (finding,) = find_change(judge(halves, 60, (120.0, 120.0)))  # type: ignore[arg-type]
-    assert "effective track" in str(finding.text)
-    assert "wheel radius" in str(finding.text)
+    assert "effective track" in format_finding(finding)
+    assert "wheel radius" in format_finding(finding)
 
 
 @pytest.mark.parametrize("seed", few(range(50, 53), 3))

@@ -31,6 +31,7 @@ from pipeline.simulate.scenario import Commands
 from pipeline.stages import Finding
 from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import find_spans
+from pipeline.words import format_finding
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": 1.7, "drive_lag": 0.3, "icr_offset": 0.1}
@@ -123,7 +124,7 @@ def test_one_of_each_kind_is_found_within_a_second_and_nothing_else() -> None:
         findings = find(case.made)
         assert is_found(case, findings), (case.incident, case.begin, case.end, findings)
         assert len(findings) == 1
-        assert "left out of all fits" in findings[0].text
+        assert "left out of all fits" in format_finding(findings[0])
 
 
 def test_a_base_that_keeps_its_last_command_is_not_driven_by_hand() -> None:

@@ -16,6 +16,7 @@ from simulated_platforms import simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.recording.log_setup import set_up_log
+from pipeline.words import format_finding
 
 ROOT = Path(__file__).parents[2]
 CASES = ROOT / ".." / "shared" / "cases"
@@ -94,9 +95,9 @@ def test_the_line_that_is_offered_settles_it(
         for config in (None, tmp_path / "line.toml")
     )
     codes = {"wheels_corrected", "command_corrected", "pose_turned", "signs_contradict"}
-    told = [one.text for one in found.findings if one.id in codes]
+    told = [format_finding(one) for one in found.findings if one.id in codes]
     assert line.split("\n")[1] in " ".join(told)
-    assert not [one.text for one in settled.findings if one.id in codes]
+    assert not [format_finding(one) for one in settled.findings if one.id in codes]
     for choice in (found, settled):
         roles = {one.role for one in choice.recording.evidence}
         assert roles >= {"command", "wheels"}
@@ -175,7 +176,7 @@ TOLD = {
 def test_a_case_of_the_field_is_told(name: str, tmp_path: Path) -> None:
     log = CASES / "logs" / f"{name}.mcap"
     setup = set_up_log(log, Options(out=tmp_path))
-    assert TOLD[name] in " ".join(one.text for one in setup.choice.findings)
+    assert TOLD[name] in " ".join(format_finding(one) for one in setup.choice.findings)
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="../shared/cases is not here")
@@ -183,7 +184,7 @@ def test_joints_that_are_not_there_are_the_reason(tmp_path: Path) -> None:
     (tmp_path / "joints.toml").write_text('[wheels]\nleft = ["no_such"]\nright = ["nor_this"]')
     options = Options(out=tmp_path, config=tmp_path / "joints.toml")
     told = set_up_log(CASES / "logs" / "y_up.mcap", options).choice.findings
-    (text,) = [one.text for one in told if one.id == "wheels_left_out"]
+    (text,) = [format_finding(one) for one in told if one.id == "wheels_left_out"]
     assert "[wheels]" in text
     assert "radius" not in text
 

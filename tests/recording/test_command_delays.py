@@ -12,6 +12,7 @@ from pipeline.analysis import Options
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.readings import Held
 from pipeline.stages import Finding
+from pipeline.words import format_finding
 
 
 def stamp(drive: Drive, late_s: float) -> np.ndarray:
@@ -26,7 +27,7 @@ def set_up(log: Path, line: str = "") -> LogSetup:
 
 def find(setup: LogSetup) -> Finding | None:
     """The finding on times of the command; None without one."""
-    return next((one for one in setup.choice.findings if "late_s" in one.text), None)
+    return next((one for one in setup.choice.findings if "late_s" in format_finding(one)), None)
 
 
 def test_of_a_command_that_acts_at_once_nothing_is_said(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.motion import Steps, fit, measure_spread
 from pipeline.simulate import Recording, make_scenario, simulate_run, write_log
 from pipeline.sources import Configuration, ConfigurationError, find_preset
+from pipeline.words import format_finding
 
 LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 BURGER = "turtlebot3_burger"
@@ -95,7 +96,7 @@ def set_up(log: Path, **overrides: object) -> LogSetup:
 
 
 def tell(choice: Choice) -> dict[str, str]:
-    return {one.id: one.text for one in choice.findings}
+    return {one.id: format_finding(one) for one in choice.findings}
 
 
 def test_a_recording_without_its_end_takes_the_vehicle_of_its_folder(

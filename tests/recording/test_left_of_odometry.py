@@ -23,6 +23,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import Flags, Floats
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.outages import find_outages
+from pipeline.words import format_finding
 
 SECONDS = 90.0
 UNSTEADY_S = 14.0
@@ -113,7 +114,7 @@ def test_a_copy_of_wheel_odometry_is_found_though_of_each_other_messages_are_lef
         keep(record_odometry(of, noise_m=2e-3), chance[0] < 0.5),
         keep(record_odometry(of, "/base_pose", noise_m=2e-3), chance[1] < 0.5),
     ]
-    found = {one.id: one.text for one in look(tmp_path / "log.mcap", topics).choice.findings}
+    found = {one.id: format_finding(one) for one in look(tmp_path / "log.mcap", topics).choice.findings}
     assert "it is that of /odom" in found["pose_from_wheels"]
 
 

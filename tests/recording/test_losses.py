@@ -11,6 +11,7 @@ from pipeline.analysis import Options
 from pipeline.core import Flags, Floats
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.stages import number_gaps
+from pipeline.words import format_finding
 
 STEP_S = 0.01
 LAG_S = 0.25
@@ -78,7 +79,7 @@ def make_robot(
 
 def set_up(path: Path, *topics: DrawnTopic) -> tuple[LogSetup, dict[str, str]]:
     setup = set_up_log(write_drawn(path, *topics), Options(out=path.parent))
-    return setup, {one.id: one.text for one in setup.choice.findings}
+    return setup, {one.id: format_finding(one) for one in setup.choice.findings}
 
 
 def draw_losses(share: float) -> Flags:

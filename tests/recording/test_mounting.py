@@ -10,13 +10,14 @@ from written_logs import write_log
 
 from pipeline.analysis import Options
 from pipeline.recording.log_setup import set_up_log
+from pipeline.words import format_finding
 
 
 def find(log: Path) -> dict[str, tuple[float, str]]:
     """Numbers and texts of what is said of the poses' place."""
     findings = set_up_log(log, Options(out=log.parent)).choice.findings
     return {
-        one.id: (float(one.value or 0.0), one.text)
+        one.id: (float(one.value or 0.0), format_finding(one))
         for one in findings
         if one.id in {"pose_angle", "pose_lever"}
     }

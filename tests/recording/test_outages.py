@@ -19,6 +19,7 @@ from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
+from pipeline.words import format_finding
 
 DIES, LIVES = 40.0, 70.0
 
@@ -120,10 +121,10 @@ def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> No
     setup = set_up_log(log, Options(out=tmp_path))
     (told,) = [one for one in setup.choice.findings if one.id == "encoder_dead"]
     assert told.severity == "warning"
-    assert "the left wheels' encoder reads nothing from 40 to 70 s" in told.text
+    assert "the left wheels' encoder reads nothing from 40 to 70 s" in format_finding(told)
     (span,) = setup.configuration.wheels.ignore
     line = f'ignore = [{{side = "left", start_s = {span.start_s:g}, end_s = {span.end_s:g}}}]'
-    assert line in told.text
+    assert line in format_finding(told)
     for given, ignore in ((line, [span]), ("ignore = []", [])):
         (tmp_path / "line.toml").write_text(f"[wheels]\n{given}")
         settled = set_up_log(log, Options(out=tmp_path, config=tmp_path / "line.toml"))

@@ -11,6 +11,7 @@ from written_logs import write_log
 from pipeline.analysis import Options
 from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.readings import Held
+from pipeline.words import format_finding
 
 TOGETHER = 1.0
 """Track and wheelbase [m]: half of it is the lever of a wheel."""
@@ -44,7 +45,7 @@ def test_an_unknown_mecanum_is_measured_whatever_its_encoders_count(backward: st
     assert setup.vehicle.wheel_radius_m == pytest.approx(RADIUS, rel=0.03)
     assert setup.vehicle.kinematics.turning_width_m(setup.vehicle) == pytest.approx(TOGETHER, rel=0.03)
     assert setup.configuration.wheels.reversed == (backward or None)
-    told = [one.text for one in setup.choice.findings if one.id == "wheels_corrected"]
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "wheels_corrected"]
     assert len(told) == bool(backward)
 
 
@@ -54,4 +55,4 @@ def test_joints_that_do_not_say_where_they_are_leave_the_body_command(tmp_path: 
     log = write_log(tmp_path / "log.mcap", drive, joints=joints, asked=asked)
     setup = set_up_log(log, Options(out=tmp_path))
     assert setup.sources.wheels is None
-    assert any("not used: /joint_states" in one.text for one in setup.choice.findings)
+    assert any("not used: /joint_states" in format_finding(one) for one in setup.choice.findings)

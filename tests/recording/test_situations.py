@@ -16,6 +16,7 @@ from pipeline.analysis import Options
 from pipeline.core import Floats
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.readings import Held, Reading
+from pipeline.words import format_finding
 
 
 def change(wheels: Reading, by: Callable[[Floats], Floats], *, exchanged: bool = False) -> Reading:
@@ -155,7 +156,7 @@ def test_a_situation_is_told_and_corrected(
     make: Callable[[Path, Drive], Path], said: list[str], keys: dict[str, object], tmp_path: Path
 ) -> None:
     setup: LogSetup = set_up_log(make(tmp_path / "log.mcap", draw(51)), Options(out=tmp_path))
-    told = " ".join(one.text for one in setup.choice.findings)
+    told = " ".join(format_finding(one) for one in setup.choice.findings)
     for text in said:
         assert text in told
     for key, value in keys.items():
@@ -172,7 +173,7 @@ def test_of_commands_in_percent_no_unit_is_sure(tmp_path: Path) -> None:
     drive = draw(54)
     log = write_log(tmp_path / "log.mcap", drive, asked=drive.asked * [125.0, 140.0])
     setup = set_up_log(log, Options(out=tmp_path))
-    told = [one.text for one in setup.choice.findings]
+    told = [format_finding(one) for one in setup.choice.findings]
     assert any("or has no unit, as percent of a throttle" in text for text in told)
     # Lengths are of the motion, and no gain of the drive is made of such numbers.
     assert setup.vehicle.wheel_radius_m == pytest.approx(0.1, rel=0.03)
@@ -187,7 +188,7 @@ def test_of_commands_from_minus_one_to_one_no_gain_is_told(tmp_path: Path) -> No
     drive = draw(54)
     log = write_log(tmp_path / "log.mcap", drive, asked=drive.asked / [1.6, 2.0], is_measured=False)
     setup = set_up_log(log, Options(out=tmp_path))
-    assert any("have no sure unit" in one.text for one in setup.choice.findings)
+    assert any("have no sure unit" in format_finding(one) for one in setup.choice.findings)
     scales = [setup.alignment.command_scale, setup.alignment.command_turn_scale]
     np.testing.assert_allclose(scales, [1.6, 2.0 * GAIN], rtol=0.03)
 
@@ -205,7 +206,9 @@ def test_a_car_that_takes_a_twist_for_a_steering_angle_is_read_so(tmp_path: Path
     )
     assert setup.vehicle.kind == "ackermann"
     assert setup.vehicle.wheelbase_m == pytest.approx(wheelbase, rel=0.03)
-    assert any("steering angles in place of yaw rates" in one.text for one in setup.choice.findings)
+    assert any(
+        "steering angles in place of yaw rates" in format_finding(one) for one in setup.choice.findings
+    )
 
 
 def test_wheels_that_several_axles_steer_are_no_differential_drive(tmp_path: Path) -> None:
@@ -221,7 +224,7 @@ def test_wheels_that_several_axles_steer_are_no_differential_drive(tmp_path: Pat
     log = write_log(tmp_path / "log.mcap", drive, joints=speeds, angles=angles)
     setup = set_up_log(log, Options(out=tmp_path))
     assert setup.sources.wheels is None
-    (told,) = [one.text for one in setup.choice.findings if one.id == "wheels_steered"]
+    (told,) = [format_finding(one) for one in setup.choice.findings if one.id == "wheels_steered"]
     assert "front_left_steering" in told
 
 
@@ -232,7 +235,7 @@ def test_wheels_of_a_known_vehicle_that_read_three_times_too_fast_are_told(tmp_p
     setup = set_up_log(log, Options(out=tmp_path, config=tmp_path / "line.toml"))
     (told,) = [one for one in setup.choice.findings if one.id == "wheels_scaled"]
     assert told.value == pytest.approx(3.0, rel=0.02)
-    assert "scale = 0.333 under [wheels]" in told.text
+    assert "scale = 0.333 under [wheels]" in format_finding(told)
 
 
 @pytest.mark.parametrize(

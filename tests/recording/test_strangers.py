@@ -21,6 +21,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import Floats, SlipError
 from pipeline.recording.log_setup import LogSetup, set_up_log
+from pipeline.words import format_finding
 
 POSE = "geometry_msgs/msg/PoseStamped"
 TWIST = "geometry_msgs/msg/TwistStamped"
@@ -69,7 +70,7 @@ def set_up(tmp_path: Path, *topics: DrawnTopic) -> LogSetup:
 
 
 def told(setup: LogSetup) -> str:
-    return " ".join(one.text for one in setup.choice.findings)
+    return " ".join(format_finding(one) for one in setup.choice.findings)
 
 
 def test_velocities_along_the_axes_of_a_map_make_no_mecanum(tmp_path: Path) -> None:

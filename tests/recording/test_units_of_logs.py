@@ -11,6 +11,7 @@ from written_logs import write_log
 
 from pipeline.analysis import Options
 from pipeline.recording.log_setup import LogSetup, set_up_log
+from pipeline.words import format_finding
 
 
 def set_up(log: Path, line: str = "") -> LogSetup:
@@ -22,7 +23,7 @@ def test_a_speed_in_kilometres_per_hour(tmp_path: Path) -> None:
     drive = draw(41)
     faster = drive.asked * [3.6, 1.0]
     setup = set_up(write_log(tmp_path / "log.mcap", drive, asked=faster))
-    told = " ".join(one.text for one in setup.choice.findings)
+    told = " ".join(format_finding(one) for one in setup.choice.findings)
     assert 'unit = "km/h"' in told
     assert setup.configuration.command.unit == "km/h"
     # The geometry is that of the command as it is meant.
@@ -65,13 +66,13 @@ def write_car(
 def test_a_car_in_other_units(speed: float, angle: float, line: str, tmp_path: Path) -> None:
     log = write_car(tmp_path / "log.mcap", speed, angle)
     setup = set_up(log)
-    told = " ".join(one.text for one in setup.choice.findings)
+    told = " ".join(format_finding(one) for one in setup.choice.findings)
     assert line in told
     assert ("unit" in told) == bool(line)
     assert setup.configuration.command.steering_unit == ("deg" if angle != 1.0 else None)
     assert setup.vehicle.wheelbase_m == pytest.approx(0.9, rel=0.03)
     if line:
-        settled = [one.text for one in set_up(log, line).choice.findings]
+        settled = [format_finding(one) for one in set_up(log, line).choice.findings]
         assert not [text for text in settled if line in text]
 
 
@@ -86,7 +87,7 @@ def test_three_speeds_of_a_car_vote_on_their_units(
     assert str(setup.sources.command) == "/drive"
     assert str(setup.sources.wheels) == "/drive_measured"
     assert (setup.configuration.command.unit, setup.configuration.wheels.unit) == (commanded_in, measured_in)
-    told = " ".join(one.text for one in setup.choice.findings)
+    told = " ".join(format_finding(one) for one in setup.choice.findings)
     assert ('unit = "m/s" takes them as recorded' in told) == bool(commanded_in or measured_in)
     assert "wheel radius" not in told
     assert setup.vehicle.wheelbase_m == pytest.approx(0.9, rel=0.03)

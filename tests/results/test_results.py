@@ -5,13 +5,13 @@ import math
 from typing import Any
 
 import msgspec
+import polars as pl
 import pytest
 from drawn_diagnoses import draw_diagnosis
 
 from pipeline.core import SlipError
 from pipeline.results import (
     DataNeed,
-    Finding,
     Growth,
     Interval,
     Named,
@@ -22,7 +22,16 @@ from pipeline.results import (
     read_result,
     to_json,
 )
-from pipeline.results.reading import find_refusal, has_no_pose, measure_excess, read_findings, read_model
+from pipeline.results.reading import (
+    find_refusal,
+    has_no_pose,
+    measure_excess,
+    read_finding_table,
+    read_findings,
+    read_model,
+)
+from pipeline.stages import Finding
+from pipeline.words import format_finding
 from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import format_verdict
 
@@ -47,7 +56,7 @@ def test_what_is_stored_is_read_back_as_it_was() -> None:
         effects=(*DRAWN.effects, OPEN),
         where=(Region("w", "time", "between", (0.0, 30.0), 0.9, 0.2),),
         need=DataNeed(known=("effective_track.k",), since_s=20.0, driven_s=60.0),
-        findings=(Finding("stuck", "it was stuck", severity="warning", t_start=1.0, t_end=2.0),),
+        findings=(Finding("stuck", "warning", values={"value": 1.0}, t_start=1.0, t_end=2.0),),
     )
     assert repr(read_result(store(run), RunDiagnosis)) == repr(run)
     stored = store(run)
@@ -55,11 +64,14 @@ def test_what_is_stored_is_read_back_as_it_was() -> None:
     assert stored["effects"][1]["growth"]["parameters"]["tau"]["half_width"] == [None, 0.1]
 
 
-def test_no_sentence_is_stored_but_those_of_findings() -> None:
-    stored, shown = store(DRAWN), diagnosis_as_json(DRAWN)
+def test_no_sentence_is_stored() -> None:
+    run = msgspec.structs.replace(DRAWN, findings=(Finding("stuck", "warning", t_start=1.0, t_end=2.0),))
+    stored, shown = store(run), diagnosis_as_json(run)
+    assert "text" not in stored["findings"][0]
+    assert shown["findings"][0]["text"].startswith("the wheels turned and the body did not move")
     assert {"verdict", "enough"} & stored.keys() == set()
     assert {"sentence", "clause"} & stored["effects"][0].keys() == set()
-    assert shown["verdict"] == format_verdict(DRAWN)
+    assert shown["verdict"] == format_verdict(run)
     assert shown["effects"][0]["sentence"].startswith("Effective track ")
 
 
@@ -105,7 +117,16 @@ def test_a_file_that_is_no_diagnosis_is_refused() -> None:
 
 
 def test_findings_of_untrusted_results_are_texts() -> None:
-    findings = read_findings({"findings": [{"id": 5, "text": None}, "no object", {"id": "not_moving"}]})
-    assert findings == (Finding("5", "", ""), Finding("not_moving", "", ""))
-    assert find_refusal([Finding("not_moving", "it stands")]) == "it stands"
+    untrusted = [{"id": 5, "text": None}, "no object", {"id": "not_moving", "severity": [], "values": 3}]
+    findings = read_findings({"findings": untrusted})
+    assert findings == (Finding("5", "info"), Finding("not_moving", "info"))
+    assert find_refusal(findings) == Finding("not_moving", "info")
+    # Of values that are not those of its sentence, its id is shown.
+    assert [format_finding(one) for one in findings] == ["5", "not moving"]
     assert not has_no_pose(findings)
+    table = pl.DataFrame(
+        {"id": "stuck", "severity": "warning", "values": [text]} for text in ("{", "[1]", "[" * 10**5)
+    )
+    assert set(map(format_finding, read_finding_table(table))) == {
+        format_finding(Finding("stuck", "warning"))
+    }

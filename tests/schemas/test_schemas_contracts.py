@@ -76,7 +76,8 @@ SLIP = {
     "g_x": 0.2, "g_y": 0.0, "g_w": 0.0, "modulus": 0.2, "suspect": False,
 }  # fmt: skip
 FINDING = {
-    **WHO, "stage": "slip", "id": "pose_gap", "severity": "info", "text": "a hole", "where": "",
+    **WHO, "stage": "slip", "id": "pose_gap", "severity": "info", "text": "a hole",
+    "where": "", "values": "{}",
     "t_start": None, "t_end": None, "value": None, "count": 1,
 }  # fmt: skip
 WINDOW = {

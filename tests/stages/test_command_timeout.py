@@ -15,6 +15,7 @@ from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.timeouts import CommandTimeout, find_timeout
 from pipeline.simulate import Program, Scenario
+from pipeline.words import format_finding
 
 STARTS = np.linspace(12.0, 280.0, 20)
 LONG_S = 1.5
@@ -48,7 +49,7 @@ def test_silences_show_when_the_base_stops(
     taken = drive(pause(timeout_s, effect, size))
     told = taken.finding("command_timeout")
     assert told.value == pytest.approx(timeout_s, abs=0.03)
-    assert "after the last command" in told.text
+    assert "after the last command" in format_finding(told)
     assert taken.aligned.alignment.hold_s == told.value, "nothing is held longer than the base does"
 
 
@@ -68,7 +69,7 @@ def test_without_encoders_the_poses_show_it(drive: TakeThrough) -> None:
 def test_who_configures_a_time_is_told_of_the_other(drive: TakeThrough) -> None:
     taken = drive(pause(0.25), {"command": {"hold_s": 1.0}})
     assert taken.aligned.alignment.hold_s == 1.0
-    assert "command.hold_s = 1 holds them longer" in taken.finding("command_timeout").text
+    assert "command.hold_s = 1 holds them longer" in format_finding(taken.finding("command_timeout"))
 
 
 def test_commands_that_were_not_recorded_are_no_silence(drive: TakeThrough) -> None:

@@ -8,6 +8,7 @@ from few import few
 from pipeline.run import Alignment, make_run
 from pipeline.sources import Vehicle, find_preset
 from pipeline.stages.drive_numbers import mark_late_starts, measure_responses
+from pipeline.words import format_finding
 
 Arrays = np.ndarray
 RATE, DEAD_S, RAMP = 20.0, 0.15, 4.0
@@ -72,7 +73,7 @@ def test_late_starts_are_marked_for_as_long_as_they_are_late(vehicle: Vehicle) -
     (found,) = findings
     assert (found.id, found.count) == ("late_start", 4)
     assert found.value == pytest.approx(0.8, abs=0.06)
-    assert "in 4 of 10 starts" in found.text
+    assert "in 4 of 10 starts" in format_finding(found)
 
 
 @pytest.mark.parametrize("seed", few(range(6), 3))

@@ -8,6 +8,7 @@ from few import few
 from stage_logs import FIELD, TakeThrough
 
 from pipeline.simulate import Ground, Program, Scenario, simulate_run
+from pipeline.words import format_finding
 
 STEPS = replace(FIELD, duration_s=300.0, seed=4)
 
@@ -26,7 +27,7 @@ def test_a_map_that_is_longer_along_one_direction_is_told_with_its_interval(
     told = drive(replace(stretch(STEPS, 0.03, along_rad), seed=seed)).finding("map_uneven")
     assert told.severity == "warning"
     assert told.value == pytest.approx(0.03, abs=0.01)
-    words = told.text.split()
+    words = format_finding(told).split()
     assert float(words[words.index("of") + 1]) == pytest.approx(np.degrees(along_rad) % 180.0, abs=12.0)
     low, high = (float(words[words.index("to") + step].strip("(")) for step in (-2, 1))
     assert low < 3.0 < high

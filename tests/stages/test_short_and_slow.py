@@ -12,6 +12,7 @@ from pipeline.stages.checks import check_delays, check_motion, check_scale
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.satellite import Turning, find_heading, follow_velocity
 from pipeline.stages.velocity import report_gyro
+from pipeline.words import format_finding
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
@@ -38,9 +39,9 @@ def test_eight_seconds_at_ten_hertz_show_a_heading_that_is_late() -> None:
     assert found.id == "heading_skew"
     assert found.value is not None
     assert abs(found.value - 0.2) < 0.03
-    assert found.text.startswith("compared with the wheels, the heading lags the position by ")
+    assert format_finding(found).startswith("compared with the wheels, the heading lags the position by ")
     (early,) = check_delays(make_samples(times, move(0.0), move(-0.2)), find_preset("husky_a200"))
-    assert "the heading leads the position by " in early.text
+    assert "the heading leads the position by " in format_finding(early)
 
 
 def test_bunches_of_seven_messages_of_a_slow_topic_are_put_back_to_its_pace() -> None:
@@ -83,4 +84,4 @@ def test_wheels_are_in_another_unit_where_the_ground_explains_the_rest(gain: flo
     revolutions = ideal / (2.0 * math.pi / 60.0)
     (finding,) = check_scale(make_samples(times, revolutions, gain * ideal), vehicle)
     assert finding.id == found
-    assert ("rpm" in finding.text) == (found == "unit_wrong")
+    assert ("rpm" in format_finding(finding)) == (found == "unit_wrong")

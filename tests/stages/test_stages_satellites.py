@@ -25,6 +25,7 @@ from pipeline.stages.satellite import (
     read_over_ground,
     to_local_plane,
 )
+from pipeline.words import format_finding
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 SKIDDING = replace(
@@ -91,7 +92,7 @@ def test_without_an_imu_the_course_is_the_heading_and_that_is_said(drive: TakeTh
     taken = drive(publishing(SKIDDING, fix("/gps/fix"), ground_velocity("/gps/vel")))
     said = taken.finding("heading_from_course")
     assert said.severity == "warning"
-    assert "lateral slip is not observable" in said.text
+    assert "lateral slip is not observable" in format_finding(said)
     # Two seconds at either end and some of the steps stand, and a standing vehicle has no course.
     assert said.value is not None
     assert 0.04 < said.value < 0.4
@@ -210,7 +211,7 @@ def test_poses_that_look_one_way_all_the_time_are_positions_alone(
     assert "not_moving" not in taken.ids()
     said = taken.finding("no_heading")
     assert said.severity == "warning"
-    assert "positions alone" in said.text
+    assert "positions alone" in format_finding(said)
     assert ("heading_from_imu" if turns else "heading_from_course") in taken.ids()
     moving = taken.slip("measured").filter(~pl.col("transitory") & (pl.col("v_x").abs() > 0.3))
     assert moving.height > 300
@@ -246,7 +247,7 @@ def test_a_number_is_the_heading_in_any_unit_and_sense(unit: str, sense: str) ->
     values = np.degrees(values) if unit == "deg" else values
     made = locate_vehicle(receiver, None, read_number(values, receiver), None, np.zeros(3))
     (said,) = [one for one in made.findings if one.id == "heading_from_imu"]
-    assert "that of /compass" in said.text
+    assert "that of /compass" in format_finding(said)
     found = 2.0 * np.arctan2(made.arrays.quaternion[:, 2], made.arrays.quaternion[:, 3])
     off = np.angle(np.exp(1j * (found - yaw[made.rows])))
     # The course of a step is that in its middle.

@@ -13,6 +13,7 @@ from pipeline.simulate import VEHICLES, Program
 from pipeline.sources import Vehicle, find_preset
 from pipeline.stages.inputs import hold_commands, interpolate_wheels
 from pipeline.stages.slip_stage import cut_windows, report_across
+from pipeline.words import format_finding
 
 
 def preset(name: str, **changes: float) -> Vehicle:
@@ -148,7 +149,7 @@ def test_wheels_that_stand_across_tell_no_turn_and_are_reported() -> None:
     assert np.isnan(found[times >= 5.0]).all()
     (finding,) = report_across(wheels)
     assert finding.count == np.count_nonzero(times >= 5.0)
-    assert "for 5 s the steered wheel stands across" in finding.text
+    assert "for 5 s the steered wheel stands across" in format_finding(finding)
     assert not report_across(wheels.filter(pl.col("t") < 5.0))
     assert not report_across(make_drive([0.0, 0.1], [1.0, 1.0]))
 

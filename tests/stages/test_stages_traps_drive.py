@@ -12,6 +12,7 @@ from pipeline.recording.command_scale import find_ratio
 from pipeline.run import read_drive
 from pipeline.simulate import VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages.drive import _mean_steering
+from pipeline.words import format_finding
 
 LONGER = replace(FIELD, duration_s=150.0)
 
@@ -165,7 +166,7 @@ def test_trap_11_a_controller_that_widens_the_track_is_found(drive: TakeThrough)
     scenario = replace(LONGER, vehicle=clearpath, recording=Recording("husky_body_command"))
     taken = drive(scenario)
     assert taken.finding("controller_multiplier").value == pytest.approx(1.875, rel=0.03)
-    assert "controller_track_multiplier = 1.8" in taken.finding("controller_multiplier").text
+    assert "controller_track_multiplier = 1.8" in format_finding(taken.finding("controller_multiplier"))
     told = drive(scenario, {"vehicle": {"controller_track_multiplier": 1.875}})
     assert "controller_multiplier" not in told.ids()
     both = told.slip("command").join(told.slip("measured"), on="stamp", suffix="_measured")
@@ -243,9 +244,9 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
     assert {finding.where for finding in found} == {"command speed", "command yaw rate"}
     assert all(finding.value is not None and 0.2 < finding.value < 0.8 for finding in found)
     (speed,) = (finding for finding in found if finding.where == "command speed")
-    assert speed.text.endswith("so this limit does not act")
+    assert format_finding(speed).endswith("so this limit does not act")
     clipped = drive(replace(FIELD, vehicle=eager, effects={"body_speed_limit": 1.0}))
-    texts = {one.where: one.text for one in clipped.findings if one.id == "command_beyond_limit"}
+    texts = {one.where: format_finding(one) for one in clipped.findings if one.id == "command_beyond_limit"}
     assert texts["command speed"].endswith("the controller may clip it")
     assert "command_beyond_limit" not in drive(FIELD).ids()
 
@@ -254,7 +255,7 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
 def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale: float) -> None:
     taken = drive(replace(LONGER, recording=Recording(command_scale=scale)))
     assert taken.finding("command_scale").value == pytest.approx(1.0 / scale, rel=0.02)
-    assert "no single scale fits" not in taken.finding("command_scale").text
+    assert "no single scale fits" not in format_finding(taken.finding("command_scale"))
     assert "controller_multiplier" not in taken.ids()
 
 
@@ -270,7 +271,7 @@ def test_trap_21_commands_of_another_vehicle_are_those_of_its_wheels_and_track(
     effects = {} if reached == 1.0 else {"difference_gain": reached}
     taken = drive(replace(LONGER, effects=effects, recording=recording))
     finding = taken.finding("command_scale")
-    assert "another vehicle (Clearpath Warthog: " in finding.text
+    assert "another vehicle (Clearpath Warthog: " in format_finding(finding)
     assert finding.value == pytest.approx(radii, rel=1e-6)
     aligned = drive(replace(LONGER, effects=effects)).aligned.tables["commands"]
     for side in ("left_aligned", "right_aligned"):

@@ -16,6 +16,7 @@ from pipeline.sources import Configuration
 from pipeline.stages.pose_topics import cut_track
 from pipeline.stages.timing import _take_off
 from pipeline.stages.velocity import compute_velocities
+from pipeline.words import format_finding
 
 SETTINGS = Configuration().velocity
 
@@ -90,7 +91,7 @@ def test_trap_10_a_pose_of_the_lidar_is_moved_to_base_link(drive: TakeThrough) -
 def test_trap_10_a_chain_with_a_correction_dated_ahead_gives_the_pose(drive: TakeThrough) -> None:
     chained = replace(PLAIN, vehicle=VEHICLES["jackal"], recording=Recording("tf"))
     taken = drive(chained)
-    assert "map to base_link" in taken.finding("transforms").text
+    assert "map to base_link" in format_finding(taken.finding("transforms"))
     steady = taken.slip("measured").filter(~pl.col("transitory"))
     assert float(steady["g_x"].abs().median()) < 5e-3
     assert taken.velocities["t"].max() > 59.0
@@ -152,13 +153,13 @@ def test_trap_18_stretches_with_a_rotated_heading_are_found(
     turned = replace(ICP, rotated_stretches=3, update_hz=update_hz)
     taken = drive(replace(FIELD, vehicle=VEHICLES[vehicle], duration_s=180.0, pose=turned))
     found = taken.finding("bad_stretch")
-    assert found.text.endswith(": left out of medians and fits")
+    assert format_finding(found).endswith(": left out of medians and fits")
     # A stretch that falls into slow driving cannot be told, one over two steps may count twice.
     assert found.count is not None
     assert 2 <= found.count <= 6
     # Kinds of faults that this run does not have are not listed.
-    assert "a rotated heading" in found.text
-    assert "(0 s)" not in found.text
+    assert "a rotated heading" in format_finding(found)
+    assert "(0 s)" not in format_finding(found)
     bad = taken.slip("measured").filter(pl.col("suspect"))
     assert float(bad["g_y"].abs().median() or 0.0) > 3.0 * float(
         taken.slip("measured").filter(~pl.col("suspect"))["g_y"].abs().median() or 0.0

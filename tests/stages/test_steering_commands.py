@@ -27,6 +27,7 @@ from pipeline.simulate.messages import twist
 from pipeline.simulate.scenario import Commands
 from pipeline.sources import find_preset
 from pipeline.store import Manifest
+from pipeline.words import format_finding
 
 _LAYOUT = Layout("ackermann", (twist("/cmd_vel", stamped=True), *LAYOUTS["ackermann"].topics[2:]))
 _TOLD = "holds steering angles in place of yaw rates"
@@ -117,4 +118,4 @@ def test_yaw_rates_beyond_the_largest_steering_are_no_angles(
     drive = Drive(times, commands, speed, turned, seen, yaw[rows] + noise[2], rows)
     log = write_drawn(tmp_path / "log.mcap", drive, is_measured=False)
     setup = set_up_log(log, Options(out=tmp_path, overrides={"vehicle": {"preset": "ackermann_car"}}))
-    assert any(_TOLD in one.text for one in setup.choice.findings) is is_told
+    assert any(_TOLD in format_finding(one) for one in setup.choice.findings) is is_told

@@ -13,6 +13,7 @@ from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.recording import FAULTS
 from pipeline.simulate import Imu, make_scenario, simulate_run, write_log
+from pipeline.words import format_finding
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "data_samples" / "husky_tile.mcap"
@@ -49,7 +50,7 @@ def test_a_wrong_line_of_the_configuration_is_corrected_or_told(
     (tmp_path / "run.toml").write_text(text)
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
     vehicle, recording = read_recording(manifest)
-    said = {f.id: f.text for f in recording.list_findings()}
+    said = {f.id: format_finding(f) for f in recording.list_findings()}
     ours = {name for name in said if name in FAULTS or name.endswith("_corrected")}
     assert ours == ({found} if found else set())
     if found:
@@ -117,7 +118,7 @@ def test_poses_in_north_east_down_are_not_taken_for_a_wrong_command(
     log = write_run(tmp_path / "run.mcap", layout, **changes)
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
     vehicle, recording = read_recording(manifest)
-    findings = {one.id: one.text for one in recording.list_findings()}
+    findings = {one.id: format_finding(one) for one in recording.list_findings()}
     assert found in findings
     for word in words:
         assert word in findings[found]

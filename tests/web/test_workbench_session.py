@@ -137,7 +137,7 @@ def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -
 @pytest.mark.parametrize("action", ["add", "formula", "fit", "try"])
 def test_no_model_is_fitted_to_a_run_that_cannot_show_slip(workbench: Workbench, action: str) -> None:
     summary = find_manifest(workbench).path("summary.json")
-    still = [{"id": "not_moving", "severity": "error", "text": "it does not move"}]
+    still = [{"id": "not_moving", "severity": "error", "values": {"error": "it does not move"}}]
     summary.write_text(json.dumps(json.loads(summary.read_text()) | {"findings": still}))
     opened = change(workbench)
     refused = workbench.refuse("/api/session", run=RUN, action=action, effect="effective_track", anyway=True)

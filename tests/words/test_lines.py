@@ -8,13 +8,13 @@ from pipeline.core import format_length
 from pipeline.models import name_term
 from pipeline.results import (
     DataNeed,
-    Finding,
     Named,
     Region,
     RunDiagnosis,
     Unexplained,
     Value,
 )
+from pipeline.stages import Finding
 from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
@@ -27,7 +27,7 @@ MANY = (
     "deadband",
     "yaw_drift",
 )
-WARNINGS = [Finding(f"w{number}", f"warning {number}", severity="warning") for number in range(5)]
+WARNINGS = [Finding(f"w{number}", "warning", values={"error": f"warning {number}"}) for number in range(5)]
 
 
 def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
@@ -67,9 +67,9 @@ def test_an_effect_on_a_screen_says_what_its_number_is(name: str, units: dict[st
 
 
 def test_a_finding_of_many_runs_is_said_once_with_its_count() -> None:
-    alike = Finding("hold", "no command had arrived", severity="warning")
+    alike = Finding("hold", "warning", values={"error": "no command had arrived"})
     runs = {f"run{number}": [alike] for number in range(48)}
-    runs["run3"] = [alike, Finding("stuck", "it was stuck", severity="error")]
+    runs["run3"] = [alike, Finding("stuck", "error", values={"error": "it was stuck"})]
     assert list_findings(runs, "", everything=False) == [
         ("findings", "!! run3: it was stuck"),
         ("", "!  48 runs: no command had arrived"),
@@ -79,7 +79,8 @@ def test_a_finding_of_many_runs_is_said_once_with_its_count() -> None:
 def test_findings_of_a_kind_are_said_once_of_many_runs_where_their_numbers_differ() -> None:
     late = {"run20": 20, "run30": 30, "run31": 30}
     runs = {
-        run: [Finding("late", f"poses are late by {ms} ms", "pose", "warning")] for run, ms in late.items()
+        run: [Finding("late", "warning", "pose", {"error": f"poses are late by {ms} ms"})]
+        for run, ms in late.items()
     }
     assert list_findings(runs, "", everything=False) == [
         ("findings", "!  3 runs, as in run30: poses are late by 30 ms")
@@ -100,7 +101,7 @@ def test_many_runs_have_one_head() -> None:
 
 def test_incidents_of_a_kind_are_one_finding() -> None:
     slides = [
-        Finding("slid", "it slid", severity="warning", t_start=start, t_end=end)
+        Finding("slid", "warning", values={"error": "it slid"}, t_start=start, t_end=end)
         for start, end in ((3.0, 4.0), (10.0, 12.5))
     ]
     ((_, text),) = list_findings({"": slides}, "", everything=False)
