@@ -47,7 +47,7 @@ from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result, read_sug
 from pipeline.results import read_model as read_diagnosed_model
 from pipeline.sources import Owner, load_vehicle
 from pipeline.store import REPORT, Manifest, Store, find_run, read_choices
-from pipeline.words import check_as_json, diagnosis_as_json, format_junit, format_markdown, list_lines
+from pipeline.words import check_as_json, diagnosis_as_json, format_junit, format_markdown, list_check_lines
 from pipeline.words import diagnosis as words
 from schemas import contract_of
 
@@ -475,7 +475,7 @@ class Check:
         return format_junit(self._checked)
 
     def __repr__(self) -> str:
-        return "\n".join(words.format_lines(list_lines(self._checked)))
+        return "\n".join(words.format_lines(list_check_lines(self._checked)))
 
     def _repr_html_(self) -> str:
         shown = self.numbers.select("number", "unit", "status", "before", "after", "spread", "p_adjusted")

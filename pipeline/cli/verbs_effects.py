@@ -197,12 +197,12 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import format_page  # noqa: PLC0415 - heavy
 
     models.load_effects(own or ())
     every = (*models.list_effects(), *models.list_own_effects().values())
     chosen = every if effect is None else (models.find_effect(effect),)
-    pages = models.list_pages(chosen) if effect is None else [format_effect(chosen[0])]
+    pages = models.list_pages(chosen) if effect is None else [format_page(chosen[0])]
     rows = [
         {
             "id": one.id,
@@ -212,7 +212,7 @@ def effects(  # noqa: D417 - the arguments document themselves
             "needs": [need.value for need in one.needs],
             "confused_with": list(one.confused_with),
             "equivalent_to": list(one.equivalent_to),
-            "page": format_effect(one),
+            "page": format_page(one),
         }
         for one in chosen
     ]

@@ -97,7 +97,7 @@ def check(  # noqa: D417 - the arguments document themselves
     if json:
         print_json({**words.check_as_json(checked), "errors": []})
     elif not quiet and (to is None or file is not None):
-        print_lines(words.format_lines(words.list_lines(checked)))
+        print_lines(words.format_lines(words.list_check_lines(checked)))
     return checked.code
 
 

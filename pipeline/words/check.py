@@ -25,7 +25,7 @@ _ONE_RUN = (
 )
 
 
-def format_verdict(check: Check) -> str:
+def format_check(check: Check) -> str:
     """What changed, and whether it is more than runs differ, in one to three sentences."""
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
@@ -93,9 +93,9 @@ def tabulate_check(check: Check) -> list[tuple[str, ...]]:
     return [_HEAD, *rows]
 
 
-def list_lines(check: Check) -> list[Line]:
+def list_check_lines(check: Check) -> list[Line]:
     """The check as labels and texts: verdict, limits, the table, compared runs, notes."""
-    lines = [("verdict", format_verdict(check))]
+    lines = [("verdict", format_check(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     table = tabulate_check(check)
     lines += [(row[0], text) for row, text in zip(table, align_rows([row[1:] for row in table]), strict=True)]
@@ -115,7 +115,7 @@ def format_markdown(check: Check) -> str:
     """The check as Markdown: verdict, limits, and the table of the screen."""
     limits = [("limit", "measured", "outcome")]
     limits += [(f"{one.name}: {one.limit}", one.measured, one.outcome) for one in check.limits]
-    parts = [f"**{_escape(format_verdict(check))}**"]
+    parts = [f"**{_escape(format_check(check))}**"]
     for head, *rows in (limits, tabulate_check(check)):
         if rows:
             lines = [head, ["---"] * len(head), *([*map(_escape, row)] for row in rows)]
@@ -159,7 +159,7 @@ def format_junit(check: Check) -> str:
         case = ET.SubElement(suite, "testcase", classname=f"slip.check.{group}", name=make_plain(name))
         if outcome in kinds:
             ET.SubElement(case, kinds[outcome], message=make_plain(text))
-    ET.SubElement(suite, "system-out").text = make_plain(format_verdict(check))
+    ET.SubElement(suite, "system-out").text = make_plain(format_check(check))
     ET.indent(suite)
     return f'<?xml version="1.0" encoding="utf-8"?>\n{ET.tostring(suite, encoding="unicode")}\n'
 
@@ -167,4 +167,4 @@ def format_junit(check: Check) -> str:
 def check_as_json(check: Check) -> dict[str, object]:
     """The JSON object of `slip check`."""
     sentences = [f"{describe_change(one)}." for one in check.list_status("changed")]
-    return check.to_json(format_verdict(check), sentences)
+    return check.to_json(format_check(check), sentences)
