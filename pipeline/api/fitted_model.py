@@ -15,7 +15,6 @@ from pipeline.core import INPUT_WORDS, number_in, objects_in
 from pipeline.datasets import ModelFit, fit_to_runs, put_on_runs
 from pipeline.estimation import EstimationData, Input, ModelState
 from pipeline.estimation.additions import Tries
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
@@ -40,7 +39,7 @@ from pipeline.models import Model as MotionModel
 from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, read_result, read_suggestion
+from pipeline.results import RunDiagnosis, read_suggestion, to_json
 from pipeline.run import HORIZON_S, MotionError, MotionRun
 from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
 from pipeline.store import Manifest, Store
@@ -248,7 +247,7 @@ class Model:
         for item in transfers:
             judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}
             for words, held_out in judged.items():
-                errors = errors_as_json(held_out.pooled)
+                errors = to_json(held_out.pooled)
                 rows.append({"run": item.run, "model": words, **{key: errors[key] for key in _OVER_2S}})
         return pl.DataFrame(rows)
 
@@ -334,7 +333,7 @@ class Model:
         with threadpool_limits(1):
             tries = Tries(data, model, run.find_suggestion(data.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
-        without = errors_as_json(tries.before)
+        without = to_json(tries.before)
         rows = [
             {
                 "effect": one.effect.id,
@@ -344,7 +343,7 @@ class Model:
                 "same_as": list(one.twins),
             }
             for one in helping
-            for errors in [errors_as_json(one.errors)]
+            for errors in [to_json(one.errors)]
         ]
         numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
         texts = {"effect": pl.String, "sentence": pl.String}
@@ -444,7 +443,7 @@ class Fit:
     def __init__(self, fit: ModelFit) -> None:
         self._fit = fit
         self.model = Model.of(fit.file)
-        self.errors = errors_as_json(fit.after.whole.errors)
+        self.errors = to_json(fit.after.whole.errors)
         self.ladder = tabulate_ladder(self.to_json())
 
     def to_json(self) -> dict[str, object]:
@@ -452,8 +451,8 @@ class Fit:
         return self._fit.to_json()
 
     def _as_diagnosis(self) -> RunDiagnosis:
-        content = self.to_json()
-        return read_result({key: content[key] for key in ("input", "ladder", "noise_floor")}, RunDiagnosis)
+        ladder = self._fit.after.ladder.as_result(self._fit.floor)
+        return RunDiagnosis(input=self._fit.chosen.source.value, ladder=ladder, noise_floor=self._fit.floor)
 
     def figures(self) -> dict[str, ShownFigure]:
         """The ladder as a chart."""

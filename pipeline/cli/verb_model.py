@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline import datasets, estimation, models, sources, store, words
+from pipeline import datasets, estimation, models, results, sources, store, words
 from pipeline.cli.conventions import (
     CLEAN,
     OwnEffects,
@@ -354,15 +354,13 @@ def _change(
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.estimation.errors import errors_as_json  # noqa: PLC0415 - heavy
-
     return {
         "model": name,
         "run": item.run,
         "terrain": item.terrain,
-        "carried": errors_as_json(item.carried.pooled),
-        "own_fit": errors_as_json(item.own.pooled),
-        "ideal": errors_as_json(item.ideal.pooled),
+        "carried": results.to_json(item.carried.pooled),
+        "own_fit": results.to_json(item.own.pooled),
+        "ideal": results.to_json(item.ideal.pooled),
         "ratio": item.ratio,
         "warning": item.warning,
     }

@@ -12,7 +12,6 @@ from pipeline.door import open_door
 if TYPE_CHECKING:
     from pipeline.estimation.diagnose import *
     from pipeline.estimation.diagnosis import *
-    from pipeline.estimation.errors import *
     from pipeline.estimation.estimation_data import *
     from pipeline.estimation.held_out import *
     from pipeline.estimation.intervals import *
@@ -32,7 +31,6 @@ else:
                 "parse_budget",
             ),
             "diagnosis": ("Diagnosis",),
-            "errors": ("Errors",),
             "estimation_data": ("EstimationData",),
             "held_out": (
                 "HeldOut",

@@ -14,12 +14,11 @@ from pipeline.core import (
     number_in,
     split_interval,
 )
-from pipeline.estimation.errors import Errors
 from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.models import AT_BOUND, UNDETERMINED
-from pipeline.results import CHANCE, ERRORS_OVER_2S, format_rises
+from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, format_rises
 from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall
 
