@@ -11,6 +11,7 @@ from typing import Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
+from pipeline.api.model_changes import export_file, find_speeds, read_on_runs
 from pipeline.core import INPUT_WORDS, number_in, objects_in
 from pipeline.datasets import ModelFit, fit_to_runs, put_on_runs
 from pipeline.estimation import EstimationData, Input, ModelState
@@ -18,11 +19,8 @@ from pipeline.estimation.additions import Tries
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
-from pipeline.estimation.run_residuals import choose_input
 from pipeline.estimation.stored_diagnosis import find_diagnosis
-from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.estimation.transfer import carry_over, fit_as_it_is
-from pipeline.export import export_model, read_current
 from pipeline.models import (
     CHANNELS,
     Effect,
@@ -132,13 +130,13 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     return FormulaEffect(name, texts, tuple(parameters))
 
 
-def load_effects(path: str | Path) -> None:
-    """Run a Python file with effects of your own, which `effect` finds and model files may name from now on.
+def load_effects(*paths: str | Path) -> None:
+    """Run Python files with effects of your own, which `effect` finds and model files may name from now on.
 
     Args:
-        path: the file, as `slip model new-effect` writes one.
+        paths: the files, as `slip model new-effect` writes one.
     """
-    catalogue.load_effects([Path(path)])
+    catalogue.load_effects([Path(path) for path in paths])
 
 
 class StoredRun:
@@ -273,9 +271,10 @@ class Model:
             A row for each terrain: ``answer`` is ``up_to``, ``every``, ``none`` or ``too_few``, ``speed_mps``
             the highest speed with its interval, beside the range that was driven and the errors at its ends.
         """
-        file, read, source = self._read(runs, input, vehicle_of)
+        manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            return pl.DataFrame(limits_as_json(limit_speeds(file, read, source, within_m, ahead_s)))
+            found = find_speeds(self.file, manifests, within_m, ahead_s, source=input, owner=vehicle_of)
+        return pl.DataFrame(found.rows)
 
     def predict(
         self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
@@ -382,13 +381,13 @@ class Model:
             current: for vesc and px4 the robot's file of parameters, which is corrected.
             gate: for autoware whether the steering offset is applied: off, on, or on and learned on.
         """
-        return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)
+        return export_file(self.file, to, current=None if current is None else Path(current), gate=gate)
 
     def _read(
         self, runs: StoredRun | Sequence[StoredRun], input: Source | None, owner: Owner | None
     ) -> tuple[ModelFile, list[MotionRun], Input]:
-        file, read = put_on_runs(self.file, _list_manifests(runs), owner)
-        return file, read, choose_input(read, input, file.model, last=file.last_input).source
+        file, read, chosen = read_on_runs(self.file, _list_manifests(runs), input, owner)
+        return file, read, chosen.source
 
     def __repr__(self) -> str:
         numbers = format_parameters(list_parameters(self.file))

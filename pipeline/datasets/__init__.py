@@ -71,6 +71,7 @@ else:
                 "pool_runs",
             ),
             "stored_fits": (
+                "ModelContest",
                 "ModelFit",
                 "contest_models",
                 "expect_model",

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pipeline.words.diagnosis import *
     from pipeline.words.effects import *
     from pipeline.words.errors import *
+    from pipeline.words.fleet import *
     from pipeline.words.models import *
     from pipeline.words.objects import *
     from pipeline.words.verdict import *
@@ -28,7 +29,8 @@ else:
                 "list_check_lines",
             ),
             "comparison": (
-                "format_ratio",
+                "format_answer",
+                "format_causes",
                 "list_answer",
                 "list_shown_notes",
                 "summarize_answer",
@@ -61,16 +63,20 @@ else:
                 "format_remaining_error",
                 "name_span",
             ),
+            "fleet": (
+                "format_fleet",
+                "format_map",
+                "format_trend",
+                "summarize_map",
+            ),
             "models": (
-                "describe_step",
+                "format_change",
                 "format_contest",
-                "format_heads",
                 "format_ladder",
-                "format_measured_errors",
                 "format_parameters",
-                "format_recordings",
                 "format_refusals",
                 "format_speed_limits",
+                "format_transfers",
                 "suggest_export",
             ),
             "objects": ("diagnosis_as_json",),
