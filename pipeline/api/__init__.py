@@ -10,8 +10,11 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.api.comparisons import *
+    from pipeline.api.diagnoses import *
+    from pipeline.api.drives import *
     from pipeline.api.fitted_model import *
     from pipeline.api.model_changes import *
+    from pipeline.api.opening import *
     from pipeline.api.runs import *
     from pipeline.core import SlipError
     from pipeline.datasets import Question
@@ -31,6 +34,15 @@ else:
                 "split_names",
                 "write_fleet",
             ),
+            "diagnoses": (
+                "diagnose_together",
+                "parse_budget",
+                "read_slip",
+            ),
+            "drives": (
+                "check_drive",
+                "plan_drive",
+            ),
             "fitted_model": (
                 "Fit",
                 "Model",
@@ -46,6 +58,10 @@ else:
                 "export_file",
                 "find_speeds",
                 "require_errors",
+            ),
+            "opening": (
+                "ReadRun",
+                "read_run",
             ),
             "runs": (
                 "Check",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, overload
 
@@ -11,8 +10,9 @@ import polars as pl
 from threadpoolctl import threadpool_limits
 
 from pipeline.analysis import Options
-from pipeline.analysis.analyze import SUMMARY, OpenedRun, analyze_log, open_run, update_datasets
+from pipeline.analysis.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.analysis.summary import find_peers
+from pipeline.api.diagnoses import diagnose_together, parse_budget
 from pipeline.api.fitted_model import (
     Model,
     StoredRun,
@@ -21,6 +21,7 @@ from pipeline.api.fitted_model import (
     take_file,
     write_html,
 )
+from pipeline.api.opening import Opener, open_quietly, read_run
 from pipeline.batch.recordings import list_named
 from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
 from pipeline.datasets import Check as RunsCheck
@@ -30,8 +31,6 @@ from pipeline.datasets import (
     read_limits,
     read_runs,
 )
-from pipeline.estimation import parse_budget
-from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis
 from pipeline.models import ModelFile, read_model
 from pipeline.report import format_distance
 from pipeline.report.motion_view import MotionView, view_diagnosis
@@ -116,15 +115,6 @@ def load(run: str, *, results: str | Path = "results") -> Run:
 def table(name: str, *, results: str | Path = "results") -> pl.LazyFrame:
     """A table over all runs of a results folder; of the table ``runs`` each row is one."""
     return Store(Path(results)).scan(name)
-
-
-Opener: TypeAlias = Callable[[str, Options], AbstractContextManager[OpenedRun]]
-"""How the results of a log or of a stored run are opened."""
-
-
-def open_quietly(name: str, options: Options) -> AbstractContextManager[OpenedRun]:
-    """The results of a log, analyzed where there are none, or of a stored run."""
-    return open_run(name, options, lambda _stage: None)
 
 
 class Run(StoredRun):
@@ -227,17 +217,15 @@ class Run(StoredRun):
             vehicle_of: whose geometry counts where the run is of another vehicle than the model.
             budget: CPU time that a search may take, for example ``60s``.
         """
-        is_plain = not others and input == "both" and model is None and budget is None
-        diagnosis = find_diagnosis(self._store.root, self.manifest) if is_plain else None
-        if diagnosis is None:
-            with threadpool_limits(1):
-                diagnosis = diagnose_stored(
-                    [run.manifest for run in (self, *others)],
-                    INPUTS if input == "both" else (input,),
-                    None if model is None else take_file(model).model,
-                    vehicle_of,
-                    None if budget is None else parse_budget(budget),
-                )
+        with threadpool_limits(1):
+            diagnosis = diagnose_together(
+                [read_run(run.manifest) for run in (self, *others)],
+                self._store.root,
+                inputs=INPUTS if input == "both" else (input,),
+                known=None if model is None else take_file(model),
+                owner=vehicle_of,
+                budget_s=None if budget is None else parse_budget(budget),
+            )[0]
         return Diagnosis(diagnosis, read_choices(self.manifest), lambda: self._draw(diagnosis))
 
     def compare_models(

@@ -33,6 +33,7 @@ else:
             ),
             "plan_files": (
                 "FILES",
+                "CheckedPlan",
                 "check_plan",
                 "choose_topic",
                 "read_plan",
