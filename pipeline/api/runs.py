@@ -24,8 +24,8 @@ from pipeline.api.fitted_model import (
 from pipeline.api.opening import Opener, open_quietly, read_run
 from pipeline.batch.recordings import list_named
 from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
-from pipeline.datasets import Check as RunsCheck
 from pipeline.datasets import (
+    RunsCheck,
     check_runs,
     contest_models,
     read_limits,

@@ -29,8 +29,8 @@ else:
                 "find_causes",
             ),
             "check": (
-                "Check",
-                "Number",
+                "RunsCheck",
+                "CheckedNumber",
                 "check_runs",
                 "read_limits",
             ),

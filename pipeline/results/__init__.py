@@ -49,7 +49,7 @@ else:
                 "Disturbance",
                 "Errors",
                 "EstimatedNumber",
-                "Evidence",
+                "GrownEvidence",
                 "Finding",
                 "Growth",
                 "Interval",

@@ -88,7 +88,7 @@ class Moves(msgspec.Struct, frozen=True):
     path_share: float
 
 
-class Evidence(msgspec.Struct, frozen=True):
+class GrownEvidence(msgspec.Struct, frozen=True):
     """Evidence `t` for an effect [standard errors] by the seconds of driving."""
 
     seconds: tuple[float, ...] = ()
@@ -110,7 +110,7 @@ class Growth(msgspec.Struct, frozen=True):
         parameters: by parameter.
     """
 
-    evidence: Evidence | None = None
+    evidence: GrownEvidence | None = None
     parameters: dict[str, Narrowing] = {}
 
 

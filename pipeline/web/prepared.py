@@ -31,7 +31,7 @@ _MOST_FITS = 60
 
 
 @dataclass(frozen=True)
-class Judged:
+class FittedModel:
     """A fitted model with its held-out errors; its intervals are computed once asked for."""
 
     step: LadderStep
@@ -61,7 +61,7 @@ class PreparedRun:
     data: EstimationData
     stage: MotionStage
     figures: Figures
-    _fits: Newest[Judged] = field(default_factory=lambda: Newest(_MOST_FITS))
+    _fits: Newest[FittedModel] = field(default_factory=lambda: Newest(_MOST_FITS))
 
     @property
     def inputs(self) -> list[str]:
@@ -74,22 +74,22 @@ class PreparedRun:
         """The noise floor of the run, by what the ideal model shows."""
         return estimate_floor(self.data)
 
-    def judge(self, model: Model) -> Judged:
+    def judge(self, model: Model) -> FittedModel:
         """Fit a model and score it on held-out data.
 
         Effects at neutral values are fitted by a search; the others start from their present values.
         """
-        return self._fits.recall(model.effects, lambda: Judged(judge_whole(self.data, model)))
+        return self._fits.recall(model.effects, lambda: FittedModel(judge_whole(self.data, model)))
 
     def measure_errors(self, model: Model) -> Errors:
         """Held-out errors of a model, fitted."""
         return self.judge(model).step.errors
 
-    def remember(self, model: Model, judged: Judged) -> None:
+    def remember(self, model: Model, judged: FittedModel) -> None:
         """Keep the fit of a model also for the model with the fitted values."""
         self._fits.keep(model.effects, judged)
 
-    def find_fit(self, model: Model) -> Judged | None:
+    def find_fit(self, model: Model) -> FittedModel | None:
         """The known fit that gave a model its present values; None if none did."""
         known = self._fits.find(model.effects)
         return (

@@ -13,7 +13,7 @@ from pipeline.results import Errors, RunDiagnosis, Step, read_model, read_sugges
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
 from pipeline.web.figures import Shown
-from pipeline.web.prepared import Judged, PreparedRun
+from pipeline.web.prepared import FittedModel, PreparedRun
 from pipeline.words import format_refusals
 
 _MOST_STEPS = 200
@@ -231,7 +231,7 @@ class Session:
             )
         return Step.of(errors, effects)
 
-    def _explain_refusals(self, judged: Judged, shown: Sequence[str]) -> dict[str, str]:
+    def _explain_refusals(self, judged: FittedModel, shown: Sequence[str]) -> dict[str, str]:
         """Reasons why effects of a fitted model are refused, by id; earlier reasons are preserved."""
         step, data = self.step, self.prepared.data
         refusals: dict[str, str] = {}

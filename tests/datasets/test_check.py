@@ -10,7 +10,15 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.datasets import ComparisonError
-from pipeline.datasets.check import BROKEN, KEPT, UNDETERMINED, Check, Number, compare_sides, read_limits
+from pipeline.datasets.check import (
+    BROKEN,
+    KEPT,
+    UNDETERMINED,
+    CheckedNumber,
+    RunsCheck,
+    compare_sides,
+    read_limits,
+)
 from pipeline.datasets.check_readings import MULTIPLIER, POSITION_ERROR, RunReading
 from pipeline.datasets.check_sides import Sides, read_under, unite_effects
 from pipeline.models.catalogue import find_effect
@@ -53,7 +61,7 @@ def same(model: ModelFile, late: Sides) -> Sides:
     return replace(late, after=read_under(model, ((), drive(USUAL, 30))).after)
 
 
-def find(check: Check, name: str) -> Number:
+def find(check: RunsCheck, name: str) -> CheckedNumber:
     return next(one for one in check.numbers if one.name == name)
 
 
@@ -152,11 +160,11 @@ def test_a_multiplier_is_a_setting_known_to_two_percent_however_many_runs(late: 
             assert find(check, MULTIPLIER).status == status
 
 
-def read_suite(found: Check) -> ET.Element:
+def read_suite(found: RunsCheck) -> ET.Element:
     return ET.fromstring(format_junit(found).encode())  # noqa: S314 - our own
 
 
-def judge(tmp_path: Path, sides: Sides, text: str) -> Check:
+def judge(tmp_path: Path, sides: Sides, text: str) -> RunsCheck:
     path = tmp_path / "check.toml"
     path.write_text(text, encoding="utf-8")
     return compare_sides(sides, read_limits(path))
