@@ -273,8 +273,8 @@ class Model:
         """
         manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            found = find_speeds(self.file, manifests, within_m, ahead_s, source=input, owner=vehicle_of)
-        return pl.DataFrame(found.rows)
+            speeds = find_speeds(self.file, manifests, within_m, ahead_s, source=input, owner=vehicle_of)
+        return pl.DataFrame(speeds.rows)
 
     def predict(
         self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None

@@ -56,7 +56,7 @@ class Change:
             "model": name,
             **self.fit.to_json(),
             "prior": self.fit.prior_as_json(),
-            "carried_over": [_tell_transfer(str(name), item) for item in self.carried],
+            "carried_over": [_transfer_as_json(str(name), item) for item in self.carried],
         }
 
 
@@ -123,7 +123,7 @@ class Carried:
         return {
             "input": self.chosen.source.value,
             "input_reason": self.chosen.reason,
-            "compared": [_tell_transfer(name, item) for name, item in self.rows],
+            "compared": [_transfer_as_json(name, item) for name, item in self.rows],
         }
 
 
@@ -270,7 +270,7 @@ def export_file(
     return export_model(file, to, used, gate)
 
 
-def _tell_transfer(name: str, item: Transfer) -> dict[str, object]:
+def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     return {
         "model": name,
         "run": item.run,

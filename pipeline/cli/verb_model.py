@@ -217,15 +217,15 @@ def speed(  # noqa: D417 - the shared options document themselves
     """
     within_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
     file = open_model(model, spoken.effects)
-    found = api.find_speeds(
+    speeds = api.find_speeds(
         file, spoken.open(), within_m, ahead_s, source=spoken.input, owner=spoken.vehicle_of
     )
-    chosen = found.chosen
+    chosen = speeds.chosen
     lines = [
-        f"{INPUT_WORDS[chosen.source.value]} of {', '.join(found.runs)} ({chosen.reason})",
-        *words.format_speed_limits(found.limits, within_m, ahead_s),
+        f"{INPUT_WORDS[chosen.source.value]} of {', '.join(speeds.runs)} ({chosen.reason})",
+        *words.format_speed_limits(speeds.limits, within_m, ahead_s),
     ]
-    return spoken.print(found.to_json(), lambda: lines, [*filter(None, [chosen.warning])])
+    return spoken.print(speeds.to_json(), lambda: lines, [*filter(None, [chosen.warning])])
 
 
 def export(  # noqa: D417 - the options document themselves

@@ -72,8 +72,8 @@ def compare(  # noqa: D417 - arguments document themselves
         content, page = words.summarize_answer(answered.result), answered.page
         lines = words.format_answer(answered.result, everything=everything)
     lines.append(f"page    {page or _NO_PAGE}")
-    told = {**content, "page": None if page is None else str(page)}
-    return print_result(told, lambda: lines, json=json, quiet=quiet)
+    answer = {**content, "page": None if page is None else str(page)}
+    return print_result(answer, lambda: lines, json=json, quiet=quiet)
 
 
 _NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"

@@ -78,8 +78,8 @@ def plan(  # noqa: D417 - the runs document themselves
         driven = api.check_drive(check, names, options, opened=opened, progress=progress)
         following = f"slip plan {shlex.join(dict.fromkeys([*driven.earlier, *names]))}{said}"
         if json:
-            kept, following_up = driven.checked, following if driven.is_open else None
-            print_json({"kept": kept.outcomes, "open": kept.open, "next": following_up, "errors": []})
+            checked, following_up = driven.checked, following if driven.is_open else None
+            print_json({"kept": checked.outcomes, "open": checked.open, "next": following_up, "errors": []})
         elif not quiet:
             print_lines([*driven.describe(), *([f"next      {following}"] if driven.is_open else [])])
         return LOSSY if driven.lossy else CLEAN
