@@ -11,16 +11,16 @@ from typing import Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.api.model_changes import export_file, find_speeds, read_on_runs
+from pipeline.api.model_changes import carry_models, change_model, export_file, find_speeds, read_on_runs
 from pipeline.core import INPUT_WORDS, number_in, objects_in
-from pipeline.datasets import ModelFit, fit_to_runs, put_on_runs
-from pipeline.estimation import EstimationData, Input, ModelState
+from pipeline.datasets import ModelFit
+from pipeline.estimation import EstimationData, ModelState
 from pipeline.estimation.additions import Tries
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.estimation.stored_diagnosis import find_diagnosis
-from pipeline.estimation.transfer import carry_over, fit_as_it_is
+from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import (
     CHANNELS,
     Effect,
@@ -38,7 +38,7 @@ from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_suggestion, to_json
-from pipeline.run import HORIZON_S, MotionError, MotionRun
+from pipeline.run import HORIZON_S, MotionError
 from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
 from pipeline.store import Manifest, Store
 from pipeline.words import format_ladder, format_parameters
@@ -221,9 +221,9 @@ class Model:
             input: what it is fed with; None as at the last fit, else as the effects need it.
             vehicle_of: whose geometry counts where a run is of another vehicle.
         """
-        file, read = put_on_runs(self.file, _list_manifests(runs), vehicle_of)
+        manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            return Fit(fit_to_runs(file, file, read, input))
+            return Fit(change_model(self.file, self.file, manifests, source=input, owner=vehicle_of).fit)
 
     def errors(
         self,
@@ -238,11 +238,11 @@ class Model:
             Three rows a run: the model as it is, its effects fitted to this run, the ideal model; the columns
             ``run model t_mrmse_m r_mrmse_rad``.
         """
-        file, read, source = self._read(runs, input, vehicle_of)
+        manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            transfers = carry_over(file.model, read, source, per_run=file.per_run)
+            carried = carry_models({"": self.file}, manifests, source=input, owner=vehicle_of)
         rows = []
-        for item in transfers:
+        for _, item in carried.rows:
             judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}
             for words, held_out in judged.items():
                 errors = to_json(held_out.pooled)
@@ -361,8 +361,8 @@ class Model:
         self, run: StoredRun, input: Source | None, owner: Owner | None
     ) -> tuple[EstimationData, ModelState]:
         """The run as estimation data, and the model on it: its values as they are, the run's own delays."""
-        file, read, source = self._read(run, input, owner)
-        data = EstimationData(read, file.model.vehicle, source)
+        file, read, chosen = read_on_runs(self.file, _list_manifests(run), input, owner)
+        data = EstimationData(read, file.model.vehicle, chosen.source)
         with threadpool_limits(1):
             return data, fit_as_it_is(data, file.model, file.per_run).state
 
@@ -382,12 +382,6 @@ class Model:
             gate: for autoware whether the steering offset is applied: off, on, or on and learned on.
         """
         return export_file(self.file, to, current=None if current is None else Path(current), gate=gate)
-
-    def _read(
-        self, runs: StoredRun | Sequence[StoredRun], input: Source | None, owner: Owner | None
-    ) -> tuple[ModelFile, list[MotionRun], Input]:
-        file, read, chosen = read_on_runs(self.file, _list_manifests(runs), input, owner)
-        return file, read, chosen.source
 
     def __repr__(self) -> str:
         numbers = format_parameters(list_parameters(self.file))

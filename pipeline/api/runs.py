@@ -21,15 +21,14 @@ from pipeline.api.fitted_model import (
     take_file,
     write_html,
 )
+from pipeline.api.model_changes import contest_models
 from pipeline.api.opening import Opener, open_quietly, read_run
 from pipeline.batch.recordings import list_named
 from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
 from pipeline.datasets import (
     RunsCheck,
     check_runs,
-    contest_models,
     read_limits,
-    read_runs,
 )
 from pipeline.models import ModelFile, read_model
 from pipeline.report import format_distance
@@ -247,10 +246,9 @@ class Run(StoredRun):
             smallest error, and what is larger by no more than chance.
         """
         files = {name: take_file(model) for name, model in (models or {}).items()}
-        known = next((file.model.vehicle for file in files.values()), None)
-        vehicle, runs = read_runs([self.manifest], known, vehicle_of)
         with threadpool_limits(1):
-            contest = contest_models(files, runs, vehicle, input).contest
+            compared, _ = contest_models(files, [self.manifest], source=input, owner=vehicle_of)
+        contest = compared.contest
         return pl.DataFrame(
             [
                 {
