@@ -14,13 +14,12 @@ import numpy as np
 
 from pipeline.core import format_share
 from pipeline.estimation.decision import LEAST_T, measure_t
-from pipeline.estimation.errors import Errors
 from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
 from pipeline.estimation.matrix import Matrix
 from pipeline.estimation.model_fit import Fitted
 from pipeline.models import Model, explain_idle
-from pipeline.results import CHANCE, format_rises, list_rises
+from pipeline.results import CHANCE, Errors, format_rises, list_rises
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:

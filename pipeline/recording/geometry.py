@@ -14,7 +14,7 @@ from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Fit, Motion, Steps
 from pipeline.recording.readings import SIDES, Explained, Reading
-from pipeline.sources import RANGES, DriveForm, find_alike
+from pipeline.sources import RANGES, DriveForm, find_alike_vehicles
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _SAME_TRACK = 0.1
@@ -300,7 +300,7 @@ def _list_shown(
 def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tuple[str, str]:
     """Id of the platform with these lengths [m], or digits of them; and what to confirm, if anything."""
     name = f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
-    alike = find_alike(radius, track) if is_shown and track is not None else {}
+    alike = find_alike_vehicles(radius, track) if is_shown and track is not None else {}
     if not alike:
         return name, ""
     first, (called, share) = next(iter(alike.items()))

@@ -7,23 +7,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from pipeline import results
-from pipeline.estimation import Errors
 from pipeline.estimation.additions import explain_refusal, explain_refusals, rank_named
-from pipeline.estimation.errors import errors_as_json
 from pipeline.models import Effect, Model, ModelFile, find_effect, name_term
-from pipeline.results import RunDiagnosis, read_model, read_result, read_suggestion
+from pipeline.results import Errors, RunDiagnosis, Step, read_model, read_suggestion
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
 from pipeline.web.figures import Shown
-from pipeline.web.prepared import Judged, PreparedRun
+from pipeline.web.prepared import FittedModel, PreparedRun
 from pipeline.words import format_refusals
 
 _MOST_STEPS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
+class Edit:
     """One model of a session with its results.
 
     Attributes:
@@ -43,7 +40,7 @@ class Step:
     order: tuple[str, ...] = ()
     intervals: Mapping[str, tuple[float, float]]
     wheel_delay_s: float = 0.0
-    ladder: tuple[results.Step, ...] = ()
+    ladder: tuple[Step, ...] = ()
     without: Mapping[str, float]
     by_hand: bool = False
     refused: Mapping[str, str]
@@ -62,11 +59,11 @@ class Session:
 
     prepared: PreparedRun
     diagnosis: RunDiagnosis | None
-    steps: tuple[Step, ...]
+    steps: tuple[Edit, ...]
     at: int = 0
 
     @property
-    def step(self) -> Step:
+    def step(self) -> Edit:
         """The current step."""
         return self.steps[self.at]
 
@@ -83,9 +80,9 @@ class Session:
         return self.named + ([] if self.diagnosis is None else list(read_suggestion(self.diagnosis, vehicle)))
 
     @property
-    def floor(self) -> results.Errors:
+    def floor(self) -> Errors:
         """The noise floor of the run: that of its diagnosis, else what the ideal model shows."""
-        known: dict[str, results.Errors | None] = {}
+        known: dict[str, Errors | None] = {}
         if self.diagnosis is not None:
             known = {name: one.noise_floor for name, one in self.diagnosis.by_path.items()}
             known[self.diagnosis.input] = self.diagnosis.noise_floor
@@ -185,7 +182,7 @@ class Session:
         is_fitted = file.model.effects and not self.step.by_hand
         return self.prepared.note_fit(file) if is_fitted else file
 
-    def _push(self, step: Step) -> Session:
+    def _push(self, step: Edit) -> Session:
         steps = (*self.steps[: self.at + 1], step)[-_MOST_STEPS:]
         return replace(self, steps=steps, at=len(steps) - 1)
 
@@ -211,7 +208,7 @@ class Session:
             for count in range(len(shown))
         ]
         delay = judged.step.fitted.state.timing[0].wheel_delay_s
-        changed = Step(
+        changed = Edit(
             said=said,
             model=model.swap(*(one.rounded for one in fitted)),
             order=tuple(order),
@@ -224,7 +221,7 @@ class Session:
         prepared.remember(changed.model, judged)
         return self._push(changed)
 
-    def _measure(self, effects: tuple[str, ...], errors: Errors) -> results.Step:
+    def _measure(self, effects: tuple[str, ...], errors: Errors) -> Step:
         if not math.isfinite(errors.t_mrmse_m + errors.r_mrmse_rad):
             raise WorkbenchError(
                 "not_finite",
@@ -232,9 +229,9 @@ class Session:
                 where=self.prepared.manifest.run,
                 hint="The model is unchanged; take other values or another formula.",
             )
-        return read_result({**errors_as_json(errors), "effects": list(effects)}, results.Step)
+        return Step.of(errors, effects)
 
-    def _explain_refusals(self, judged: Judged, shown: Sequence[str]) -> dict[str, str]:
+    def _explain_refusals(self, judged: FittedModel, shown: Sequence[str]) -> dict[str, str]:
         """Reasons why effects of a fitted model are refused, by id; earlier reasons are preserved."""
         step, data = self.step, self.prepared.data
         refusals: dict[str, str] = {}
@@ -251,6 +248,6 @@ class Session:
 
 def open_session(prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Session:
     """A new session with the ideal model, fitted."""
-    step = Step(said="ideal model", model=Model(prepared.vehicle), intervals={}, without={}, refused={})
+    step = Edit(said="ideal model", model=Model(prepared.vehicle), intervals={}, without={}, refused={})
     fitted = Session(prepared, diagnosis, (step,)).fit()
     return Session(prepared, diagnosis, (replace(fitted.step, said=step.said),))

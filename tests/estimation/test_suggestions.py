@@ -11,12 +11,12 @@ import pytest
 from verbs import run_verb
 
 from pipeline.estimation.additions import rank_named
-from pipeline.estimation.errors import Errors
 from pipeline.estimation.ladder import lowers_errors, raises_errors
 from pipeline.estimation.largest import _is_one_speed
 from pipeline.estimation.terms import list_terms
 from pipeline.models import Model, find_effect, read_model
 from pipeline.models.formula import FormulaEffect
+from pipeline.results import Errors
 from pipeline.sources import find_preset
 
 SHARED = Path(__file__).parents[3] / "shared"
