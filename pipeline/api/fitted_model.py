@@ -37,7 +37,7 @@ from pipeline.models import Model as MotionModel
 from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, read_suggestion, to_json
+from pipeline.results import RunDiagnosis, read_diagnosed, to_json
 from pipeline.run import HORIZON_S, MotionError
 from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
 from pipeline.store import Manifest, Store
@@ -160,10 +160,10 @@ class StoredRun:
         """Slip per time step: the table ``slip`` without the rows that medians leave out."""
         return self.table("slip").filter(~pl.col("suspect"))
 
-    def find_suggestion(self, vehicle: Vehicle) -> tuple[Effect, ...]:
-        """The formula that its stored diagnosis suggests; empty without one."""
+    def list_diagnosed(self, vehicle: Vehicle) -> tuple[Effect, ...]:
+        """What its stored diagnosis names, and the formula that it suggests; empty without one."""
         diagnosis = find_diagnosis(self._store.root, self.manifest)
-        return () if diagnosis is None else read_suggestion(diagnosis, vehicle)
+        return () if diagnosis is None else read_diagnosed(diagnosis, vehicle)
 
 
 class Model:
@@ -308,9 +308,9 @@ class Model:
     ) -> pl.DataFrame:
         """What it lacks to describe a run: the effects that help, the most helpful first.
 
-        The model is fitted to the run, then with each effect whose signature is in its residual, and with the
-        formula that the run's diagnosis suggests, and judged on data that the fit has not seen, as the
-        workbench does it; what does not help is left out.
+        The model is fitted to the run, then with each effect that the run's diagnosis names, with the formula
+        that it suggests, and with each other effect whose signature is in the residual; each is judged as the
+        diagnosis does. The workbench offers the same, `slip model add` accepts it, and the rest is left out.
 
         Args:
             run: an analyzed run.
@@ -330,7 +330,7 @@ class Model:
         data, state = self._prepare(run, input, vehicle_of)
         model = replace(self.file.model, vehicle=data.vehicle, effects=state.effects_of(0))
         with threadpool_limits(1):
-            tries = Tries(data, model, run.find_suggestion(data.vehicle))
+            tries = Tries(data, model, run.list_diagnosed(data.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
         without = to_json(tries.before)
         rows = [

@@ -49,9 +49,9 @@ class ModelFit:
         return self.after.floor
 
     def explain_refusals(self) -> dict[str, str]:
-        """Reasons why added effects do not reduce the held-out error, by id; empty if they do."""
-        before, after = self.before.whole, self.after.whole
-        return explain_refusals(self.after.data, before, after, lambda: self.file.intervals)
+        """Why added effects would not be accepted, by id; empty where they would."""
+        after = self.after.whole
+        return explain_refusals(after, set(after.effects).difference(self.before.whole.effects))
 
     def prior_as_json(self) -> dict[str, dict[str, object]]:
         """What was known of the numbers before the fit, by label: value, 95 % interval and unit."""

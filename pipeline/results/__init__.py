@@ -35,6 +35,7 @@ else:
                 "list_rises",
                 "measure_excess",
                 "rank_main",
+                "read_diagnosed",
                 "read_error",
                 "read_findings",
                 "read_model",

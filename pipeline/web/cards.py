@@ -37,7 +37,6 @@ def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str,
     return {
         **describe_effect(effect, model),
         "left": addition.remaining,
-        "helps": addition.helps,
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},
         "to": {"t": after.t_mrmse_m, "r": after.r_mrmse_rad},

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from pipeline.estimation.additions import explain_refusal, explain_refusals, rank_named
+from pipeline.estimation.additions import explain_refusals, weigh_addition
 from pipeline.models import Effect, Model, ModelFile, find_effect, name_term
-from pipeline.results import Errors, RunDiagnosis, Step, read_model, read_suggestion
+from pipeline.results import Errors, RunDiagnosis, Step, read_diagnosed, read_model
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
 from pipeline.web.figures import Shown
-from pipeline.web.prepared import FittedModel, PreparedRun
+from pipeline.web.prepared import PreparedRun
 from pipeline.words import format_refusals
 
 _MOST_STEPS = 200
@@ -74,10 +74,9 @@ class Session:
         return [] if file is None else list(file.model)
 
     @cached_property
-    def diagnosed(self) -> list[Effect]:
+    def diagnosed(self) -> tuple[Effect, ...]:
         """What the diagnosis of the run found, its formula too: fits of these effects begin at its values."""
-        vehicle = self.prepared.vehicle
-        return self.named + ([] if self.diagnosis is None else list(read_suggestion(self.diagnosis, vehicle)))
+        return () if self.diagnosis is None else read_diagnosed(self.diagnosis, self.prepared.vehicle)
 
     @property
     def floor(self) -> Errors:
@@ -103,17 +102,15 @@ class Session:
         return model.swap(*(one for one in known if not model.effect(one.id).fixed))
 
     def list_offers(self) -> list[dict[str, object]]:
-        """What the diagnosis has beyond the model, as JSON, the largest gain first."""
-        prepared, step = self.prepared, self.step
-        file = None if self.diagnosis is None else read_model(self.diagnosis)
-        intervals = {} if file is None else file.intervals
-        missing = (one for one in self.diagnosed if one.id not in step.order)
-        sound = tuple(one for one in missing if explain_refusal(one, intervals) is None)
-        offered = prepared.data.active_effects(Model(prepared.vehicle, sound))
-        before = prepared.score(step.model, step.wheel_delay_s)
-        model = self.begin(step.model)
-        ranked = rank_named(prepared.measure_errors, model, before, offered)
-        return [show_addition(one, before, model) for one in ranked]
+        """What the diagnosis has beyond the model and would be accepted, as JSON, the largest gain first."""
+        prepared, step, model = self.prepared, self.step, self.begin(self.step.model)
+        before = prepared.judge(model).step
+        missing = tuple(one for one in self.diagnosed if one.id not in step.order)
+        active = prepared.data.active_effects(Model(prepared.vehicle, missing))
+        weighed = (weigh_addition(before, prepared.judge(model + one).step, one.id) for one in active)
+        accepted = [one for one in weighed if one is not None and not one.refusal]
+        errors = prepared.score(step.model, step.wheel_delay_s)
+        return [show_addition(one, errors, model) for one in sorted(accepted, key=lambda one: one.remaining)]
 
     def add(self, effects: Sequence[Effect | str], *, anyway: bool = False) -> Session:
         """Add effects to the model at once, and fit the whole model.
@@ -216,7 +213,7 @@ class Session:
             wheel_delay_s=delay,
             ladder=(*below, self._measure(shown, judged.step.errors)),
             without={name: prepared.score(fitted - name, delay).t_mrmse_m for name in shown},
-            refused=self._explain_refusals(judged, shown),
+            refused=explain_refusals(judged.step, shown),
         )
         prepared.remember(changed.model, judged)
         return self._push(changed)
@@ -230,20 +227,6 @@ class Session:
                 hint="The model is unchanged; take other values or another formula.",
             )
         return Step.of(errors, effects)
-
-    def _explain_refusals(self, judged: FittedModel, shown: Sequence[str]) -> dict[str, str]:
-        """Reasons why effects of a fitted model are refused, by id; earlier reasons are preserved."""
-        step, data = self.step, self.prepared.data
-        refusals: dict[str, str] = {}
-        intervals = judged.estimates.shared_intervals
-        if not set(shown) <= set(step.order):
-            before = self.prepared.judge(step.model).step
-            refusals = explain_refusals(data, before, judged.step, lambda: intervals)
-        for name in (name for name in shown if name in step.order):
-            why = explain_refusal(judged.step.fitted.model.effect(name), intervals, data.conditions)
-            if why := why or step.refused.get(name):
-                refusals[name] = why
-        return refusals
 
 
 def open_session(prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Session:
