@@ -11,19 +11,16 @@ from typing import Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
+from pipeline.api.model_changes import carry_models, change_model, export_file, find_speeds, read_on_runs
 from pipeline.core import INPUT_WORDS, number_in, objects_in
-from pipeline.datasets import ModelFit, fit_to_runs, put_on_runs
-from pipeline.estimation import EstimationData, Input, ModelState
+from pipeline.datasets import ModelFit
+from pipeline.estimation import EstimationData, ModelState
 from pipeline.estimation.additions import Tries
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
-from pipeline.estimation.run_residuals import choose_input
 from pipeline.estimation.stored_diagnosis import find_diagnosis
-from pipeline.estimation.tolerance import limit_speeds, limits_as_json
-from pipeline.estimation.transfer import carry_over, fit_as_it_is
-from pipeline.export import export_model, read_current
+from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import (
     CHANNELS,
     Effect,
@@ -40,8 +37,8 @@ from pipeline.models import Model as MotionModel
 from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, read_result, read_suggestion
-from pipeline.run import HORIZON_S, MotionError, MotionRun
+from pipeline.results import RunDiagnosis, read_diagnosed, to_json
+from pipeline.run import HORIZON_S, MotionError
 from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
 from pipeline.store import Manifest, Store
 from pipeline.words import format_ladder, format_parameters
@@ -133,13 +130,13 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     return FormulaEffect(name, texts, tuple(parameters))
 
 
-def load_effects(path: str | Path) -> None:
-    """Run a Python file with effects of your own, which `effect` finds and model files may name from now on.
+def load_effects(*paths: str | Path) -> None:
+    """Run Python files with effects of your own, which `effect` finds and model files may name from now on.
 
     Args:
-        path: the file, as `slip model new-effect` writes one.
+        paths: the files, as `slip model new-effect` writes one.
     """
-    catalogue.load_effects([Path(path)])
+    catalogue.load_effects([Path(path) for path in paths])
 
 
 class StoredRun:
@@ -163,10 +160,10 @@ class StoredRun:
         """Slip per time step: the table ``slip`` without the rows that medians leave out."""
         return self.table("slip").filter(~pl.col("suspect"))
 
-    def find_suggestion(self, vehicle: Vehicle) -> tuple[Effect, ...]:
-        """The formula that its stored diagnosis suggests; empty without one."""
+    def list_diagnosed(self, vehicle: Vehicle) -> tuple[Effect, ...]:
+        """What its stored diagnosis names, and the formula that it suggests; empty without one."""
         diagnosis = find_diagnosis(self._store.root, self.manifest)
-        return () if diagnosis is None else read_suggestion(diagnosis, vehicle)
+        return () if diagnosis is None else read_diagnosed(diagnosis, vehicle)
 
 
 class Model:
@@ -224,9 +221,9 @@ class Model:
             input: what it is fed with; None as at the last fit, else as the effects need it.
             vehicle_of: whose geometry counts where a run is of another vehicle.
         """
-        file, read = put_on_runs(self.file, _list_manifests(runs), vehicle_of)
+        manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            return Fit(fit_to_runs(file, file, read, input))
+            return Fit(change_model(self.file, self.file, manifests, source=input, owner=vehicle_of).fit)
 
     def errors(
         self,
@@ -241,14 +238,14 @@ class Model:
             Three rows a run: the model as it is, its effects fitted to this run, the ideal model; the columns
             ``run model t_mrmse_m r_mrmse_rad``.
         """
-        file, read, source = self._read(runs, input, vehicle_of)
+        manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            transfers = carry_over(file.model, read, source, per_run=file.per_run)
+            carried = carry_models({"": self.file}, manifests, source=input, owner=vehicle_of)
         rows = []
-        for item in transfers:
+        for _, item in carried.rows:
             judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}
             for words, held_out in judged.items():
-                errors = errors_as_json(held_out.pooled)
+                errors = to_json(held_out.pooled)
                 rows.append({"run": item.run, "model": words, **{key: errors[key] for key in _OVER_2S}})
         return pl.DataFrame(rows)
 
@@ -274,9 +271,10 @@ class Model:
             A row for each terrain: ``answer`` is ``up_to``, ``every``, ``none`` or ``too_few``, ``speed_mps``
             the highest speed with its interval, beside the range that was driven and the errors at its ends.
         """
-        file, read, source = self._read(runs, input, vehicle_of)
+        manifests = _list_manifests(runs)
         with threadpool_limits(1):
-            return pl.DataFrame(limits_as_json(limit_speeds(file, read, source, within_m, ahead_s)))
+            speeds = find_speeds(self.file, manifests, within_m, ahead_s, source=input, owner=vehicle_of)
+        return pl.DataFrame(speeds.rows)
 
     def predict(
         self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
@@ -310,9 +308,9 @@ class Model:
     ) -> pl.DataFrame:
         """What it lacks to describe a run: the effects that help, the most helpful first.
 
-        The model is fitted to the run, then with each effect whose signature is in its residual, and with the
-        formula that the run's diagnosis suggests, and judged on data that the fit has not seen, as the
-        workbench does it; what does not help is left out.
+        The model is fitted to the run, then with each effect that the run's diagnosis names, with the formula
+        that it suggests, and with each other effect whose signature is in the residual; each is judged as the
+        diagnosis does. The workbench offers the same, `slip model add` accepts it, and the rest is left out.
 
         Args:
             run: an analyzed run.
@@ -332,9 +330,9 @@ class Model:
         data, state = self._prepare(run, input, vehicle_of)
         model = replace(self.file.model, vehicle=data.vehicle, effects=state.effects_of(0))
         with threadpool_limits(1):
-            tries = Tries(data, model, run.find_suggestion(data.vehicle))
+            tries = Tries(data, model, run.list_diagnosed(data.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
-        without = errors_as_json(tries.before)
+        without = to_json(tries.before)
         rows = [
             {
                 "effect": one.effect.id,
@@ -344,7 +342,7 @@ class Model:
                 "same_as": list(one.twins),
             }
             for one in helping
-            for errors in [errors_as_json(one.errors)]
+            for errors in [to_json(one.errors)]
         ]
         numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
         texts = {"effect": pl.String, "sentence": pl.String}
@@ -363,8 +361,8 @@ class Model:
         self, run: StoredRun, input: Source | None, owner: Owner | None
     ) -> tuple[EstimationData, ModelState]:
         """The run as estimation data, and the model on it: its values as they are, the run's own delays."""
-        file, read, source = self._read(run, input, owner)
-        data = EstimationData(read, file.model.vehicle, source)
+        file, read, chosen = read_on_runs(self.file, _list_manifests(run), input, owner)
+        data = EstimationData(read, file.model.vehicle, chosen.source)
         with threadpool_limits(1):
             return data, fit_as_it_is(data, file.model, file.per_run).state
 
@@ -383,13 +381,7 @@ class Model:
             current: for vesc and px4 the robot's file of parameters, which is corrected.
             gate: for autoware whether the steering offset is applied: off, on, or on and learned on.
         """
-        return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)
-
-    def _read(
-        self, runs: StoredRun | Sequence[StoredRun], input: Source | None, owner: Owner | None
-    ) -> tuple[ModelFile, list[MotionRun], Input]:
-        file, read = put_on_runs(self.file, _list_manifests(runs), owner)
-        return file, read, choose_input(read, input, file.model, last=file.last_input).source
+        return export_file(self.file, to, current=None if current is None else Path(current), gate=gate)
 
     def __repr__(self) -> str:
         numbers = format_parameters(list_parameters(self.file))
@@ -444,7 +436,7 @@ class Fit:
     def __init__(self, fit: ModelFit) -> None:
         self._fit = fit
         self.model = Model.of(fit.file)
-        self.errors = errors_as_json(fit.after.whole.errors)
+        self.errors = to_json(fit.after.whole.errors)
         self.ladder = tabulate_ladder(self.to_json())
 
     def to_json(self) -> dict[str, object]:
@@ -452,8 +444,8 @@ class Fit:
         return self._fit.to_json()
 
     def _as_diagnosis(self) -> RunDiagnosis:
-        content = self.to_json()
-        return read_result({key: content[key] for key in ("input", "ladder", "noise_floor")}, RunDiagnosis)
+        ladder = self._fit.after.ladder.as_result(self._fit.floor)
+        return RunDiagnosis(input=self._fit.chosen.source.value, ladder=ladder, noise_floor=self._fit.floor)
 
     def figures(self) -> dict[str, ShownFigure]:
         """The ladder as a chart."""

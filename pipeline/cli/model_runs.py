@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline import datasets, models, sources, store, words
+from pipeline import api, models, sources, store, words
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
@@ -149,13 +149,12 @@ def compare_rivals(files: Mapping[str, models.ModelFile], spoken: On) -> int:
         files: models by the name of their file; may be empty.
         spoken: the runs, and how the answer is printed.
     """
-    known = next((file.model.vehicle for file in files.values()), None)
-    vehicle, runs = datasets.read_runs(spoken.open(), known, spoken.vehicle_of)
-    contest = datasets.contest_models(files, runs, vehicle, spoken.input)
+    contest, kind = api.contest_models(files, spoken.open(), source=spoken.input, owner=spoken.vehicle_of)
     warnings = [contest.chosen.warning] if contest.chosen.warning else []
-    if len(models.list_models(vehicle)) == 1:
+    # The ideal model is one of them.
+    if len(contest.contest.rivals) == len(files) + 1:
         warnings.append(
-            f"no model of the literature but the ideal one describes a {vehicle.kind} vehicle: "
+            f"no model of the literature but the ideal one describes a {kind} vehicle: "
             "`slip model literature` lists each model with its vehicles"
         )
     fed = f"{INPUT_WORDS[contest.chosen.source.value]} of {', '.join(contest.runs)} ({contest.chosen.reason})"

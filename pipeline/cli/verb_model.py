@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline import datasets, estimation, models, sources, store, words
+from pipeline import api, models, sources, words
 from pipeline.cli.conventions import (
     CLEAN,
     OwnEffects,
@@ -29,9 +29,6 @@ from pipeline.cli.model_runs import (
     read_seconds,
 )
 from pipeline.core import INPUT_WORDS, SlipError
-
-if TYPE_CHECKING:
-    from pipeline.estimation.transfer import Transfer
 
 
 def build_model() -> App:
@@ -87,14 +84,11 @@ def show(  # noqa: D417 - the shared option documents itself
         model: the model file.
         json: print one JSON object.
     """
-    from pipeline.estimation.estimates import list_parameters  # noqa: PLC0415 - heavy
-    from pipeline.export import export_model  # noqa: PLC0415
-
     file = open_model(model, effects)
     if json:
-        sys.stdout.write(export_model(file, "json"))
+        sys.stdout.write(api.export_file(file, "json"))
         return CLEAN
-    parameters = words.format_parameters(list_parameters(file))
+    parameters = words.format_parameters(api.list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     lines += _list_idle(file.model)
     if runs := file.list_fitted("runs"):
@@ -168,7 +162,7 @@ def fit(  # noqa: D417 - the shared options document themselves
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
         models.load_effects(spoken.effects or ())
-        file = datasets.expect_model(spoken.open(), spoken.input, store.Store(spoken.results))
+        file = api.expect_model(spoken.open(), spoken.input, spoken.results)
     elif model is None:
         hint = "Give one, or use the fleet's prior: --prior fleet."
         raise SlipError("no_model", "no model file was given", where="slip model fit", hint=hint)
@@ -200,32 +194,12 @@ def compare(  # noqa: D417 - the shared options document themselves
     opened = [open_model(path, spoken.effects) for path in paths]
     if against is not None:
         return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken)
-    manifests = spoken.open()
-    files = [datasets.put_on_runs(file, manifests, spoken.vehicle_of) for file in opened]
-    # Both models use the same input, so that their errors are comparable.
-    last = {file.last_input for file, _ in files}
-    effects = [effect for file, _ in files for effect in file.model]
-    only = last.pop() if len(last) == 1 else None
-    chosen = estimation.choose_input(files[0][1], spoken.input, effects, last=only)
-    rows: list[tuple[str, Transfer]] = []
-    warnings = [chosen.warning]
-    for path, (file, runs) in zip(paths, files, strict=True):
-        own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in runs}
-        seen = "its error there is not a held-out error"
-        warnings += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
-        fitted_on = [str(run.get("terrain")) for run in file.list_fitted("runs")]
-        carried = estimation.carry_over(
-            file.model, runs, chosen.source, fitted_on=fitted_on, per_run=file.per_run
-        )
-        rows += [(str(path), item) for item in carried]
-    content = {
-        "input": chosen.source.value,
-        "input_reason": chosen.reason,
-        "compared": [_transfer_as_json(name, item) for name, item in rows],
-    }
-    fed = f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})"
-    warnings += [item.warning for _, item in rows]
-    return spoken.print(content, lambda: [fed, *_format_transfers(rows)], [*filter(None, warnings)])
+    files = dict(zip(map(str, paths), opened, strict=True))
+    carried = api.carry_models(files, spoken.open(), source=spoken.input, owner=spoken.vehicle_of)
+    fed = f"{INPUT_WORDS[carried.chosen.source.value]} ({carried.chosen.reason})"
+    return spoken.print(
+        carried.to_json(), lambda: [fed, *words.format_transfers(carried.rows)], carried.warnings
+    )
 
 
 def speed(  # noqa: D417 - the shared options document themselves
@@ -241,24 +215,17 @@ def speed(  # noqa: D417 - the shared options document themselves
         within: largest error of the predicted position, for example 10cm.
         ahead: how far ahead, up to 2s.
     """
-    from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415 - heavy
-
-    tolerance_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
-    opened = open_model(model, spoken.effects)
-    file, runs = datasets.put_on_runs(opened, spoken.open(), spoken.vehicle_of)
-    chosen = estimation.choose_input(runs, spoken.input, file.model, last=file.last_input)
-    limits = limit_speeds(file, runs, chosen.source, tolerance_m, ahead_s)
-    content = {
-        "within_m": tolerance_m,
-        "ahead_s": ahead_s,
-        "input": chosen.source.value,
-        "terrains": limits_as_json(limits),
-    }
+    within_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
+    file = open_model(model, spoken.effects)
+    speeds = api.find_speeds(
+        file, spoken.open(), within_m, ahead_s, source=spoken.input, owner=spoken.vehicle_of
+    )
+    chosen = speeds.chosen
     lines = [
-        f"{INPUT_WORDS[chosen.source.value]} of {', '.join(run.name for run in runs)} ({chosen.reason})",
-        *words.format_speed_limits(limits, tolerance_m, ahead_s),
+        f"{INPUT_WORDS[chosen.source.value]} of {', '.join(speeds.runs)} ({chosen.reason})",
+        *words.format_speed_limits(speeds.limits, within_m, ahead_s),
     ]
-    return spoken.print(content, lambda: lines, [*filter(None, [chosen.warning])])
+    return spoken.print(speeds.to_json(), lambda: lines, [*filter(None, [chosen.warning])])
 
 
 def export(  # noqa: D417 - the options document themselves
@@ -292,14 +259,11 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
-    from pipeline.export import export_model, read_current, require_errors  # noqa: PLC0415 - heavy
-
-    used = None if current is None else read_current(current, to)
     opened = open_model(model, effects)
     if on:
-        require_errors(to)
-        opened = datasets.judge_measured(opened, On(on=on, results=results).open())
-    text = export_model(opened, to, used, gate)
+        api.require_errors(to)
+    runs = On(on=on, results=results).open() if on else ()
+    text = api.export_file(opened, to, current=current, gate=gate, runs=runs)
     if file is None:
         sys.stdout.write(text)
     else:
@@ -323,81 +287,32 @@ def _change(
     Raises:
         SlipError: ``no_help``, with ``must_help``: the file is unchanged.
     """
-    after, gathered = datasets.put_on_runs(after, spoken.open(*predict), spoken.vehicle_of)
-    runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
-    fleet = None if prior is None else store.Store(spoken.results)
-    fit = datasets.fit_to_runs(before, after, runs, spoken.input, first_s=first_s, fleet=fleet)
-    refusals = fit.explain_refusals()
+    gathered = spoken.open(*predict)
+    changed = api.change_model(
+        before,
+        after,
+        gathered[: len(spoken.on)],
+        gathered[len(spoken.on) :],
+        source=spoken.input,
+        owner=spoken.vehicle_of,
+        first_s=first_s,
+        fleet=None if prior is None else spoken.results,
+    )
+    refusals = changed.refusals
     if must_help and refusals:
-        added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
-        hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
+        hint = "Add the others without it" if len(refusals) < len(changed.added) else "Choose another effect"
         what = f"{words.format_refusals(refusals)}: the model is unchanged"
         raise SlipError("no_help", what, where=str(path), hint=f"{hint}, or give --anyway")
     if path is not None:
-        models.write_model(fit.file, path)
-    provenance = {"fitted_on": [run.terrain for run in runs], "per_run": fit.file.per_run}
-    carried = estimation.carry_over(fit.file.model, others, fit.chosen.source, **provenance) if others else []
-    content = {
-        "model": None if path is None else str(path),
-        **fit.to_json(),
-        "prior": fit.prior_as_json(),
-        "carried_over": [_transfer_as_json(str(path), item) for item in carried],
-    }
+        models.write_model(changed.fit.file, path)
 
     def format_lines() -> list[str]:
-        lines = _format_change(fit, refusals)
+        lines = words.format_change(changed.fit, refusals)
         lines += [] if path is None else [f"written: {path}"]
-        return lines + (["", *_format_transfers([(str(path), item) for item in carried])] if carried else [])
+        rows = [(str(path), item) for item in changed.carried]
+        return lines + (["", *words.format_transfers(rows)] if rows else [])
 
-    warnings = [text for text in (fit.chosen.warning, *(item.warning for item in carried)) if text]
-    return spoken.print(content, format_lines, warnings)
-
-
-def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.estimation.errors import errors_as_json  # noqa: PLC0415 - heavy
-
-    return {
-        "model": name,
-        "run": item.run,
-        "terrain": item.terrain,
-        "carried": errors_as_json(item.carried.pooled),
-        "own_fit": errors_as_json(item.own.pooled),
-        "ideal": errors_as_json(item.ideal.pooled),
-        "ratio": item.ratio,
-        "warning": item.warning,
-    }
-
-
-def _format_change(fit: datasets.ModelFit, refusals: Mapping[str, str]) -> list[str]:
-    from pipeline.estimation.estimates import parameters_as_json  # noqa: PLC0415 - heavy
-
-    old, new, chosen = fit.before, fit.after, fit.chosen
-    runs = ", ".join(new.data.names)
-    lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
-    lines += words.format_recordings([run_residuals.run for run_residuals in new.data.residuals_by_run])
-    if old is not new:
-        lines += ["", "before", *words.format_ladder(old.ladder, fit.floor), "", "after"]
-    lines += words.format_ladder(new.ladder, fit.floor)
-    if old is not new:
-        lines += words.describe_step(
-            old.whole, new.whole, words.format_refusals(refusals) if refusals else ""
-        )
-    if chosen.warning:
-        lines.append(chosen.warning)
-    parameters = parameters_as_json(new.fitted.model, new.estimates)
-    prior = fit.prior_as_json()
-    lines += ["", "parameters", *words.format_parameters(parameters)]
-    return [*lines, "", "prior", *words.format_parameters(prior)] if prior else lines
-
-
-def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    lines = list(words.format_heads("held-out error of"))
-    for name, item in rows:
-        lines.append(words.format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
-        lines.append(words.format_measured_errors(f"  {Path(name).name} as given", item.carried.pooled))
-        lines.append(words.format_measured_errors("  refitted to this run", item.own.pooled))
-        lines.append(f"  error as given over error refitted: {item.ratio:.2f}")
-    return lines
+    return spoken.print(changed.to_json(None if path is None else str(path)), format_lines, changed.warnings)
 
 
 def _list_effects(ids: Sequence[str]) -> str:

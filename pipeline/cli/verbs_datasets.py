@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline import datasets, store, words
-from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
-from pipeline.core import (
-    INPUT_WORDS,
-    PACKAGE,
-    FigureFormat,
-    align_rows,
-    format_count,
-    format_share,
-    format_two,
-    split_interval,
-    suffix_unit,
-)
+from pipeline import api, words
+from pipeline.cli.conventions import All, Results, open_results, print_result
+from pipeline.core import PACKAGE, FigureFormat
 
 
 def compare(  # noqa: D417 - arguments document themselves
@@ -67,105 +56,27 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the lines.
         quiet: print nothing.
     """
-    from pipeline.datasets import Question, compare_results, find_causes  # noqa: PLC0415 - heavy
-    from pipeline.report.datasets_page import write_answer, write_causes  # noqa: PLC0415 - heavy
-
     # Alone or before datasets, a folder is that of the results.
     is_folder = len(datasets) == 1 or (datasets and Path(datasets[0]).is_dir())
     if is_folder and results == Path("results"):
         results, datasets = Path(datasets[0]), datasets[1:]
-    names = tuple(name.strip() for name in by.split(",") if name.strip())
-    question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
-    folder = store.Store(results)
+    question = api.Question(
+        api.split_names(by), fed, as_published=as_published, datasets=datasets, vehicle=vehicle
+    )
     if causes:
-        compared = find_causes(folder, question)
-        written = write_causes(folder, compared, figures)
-        content, lines = compared.to_json(), _format_causes(compared, everything=everything)
+        compared = api.compare_causes(results, question, figures)
+        content, page = compared.result.to_json(), compared.page
+        lines = words.format_causes(compared.result, everything=everything)
     else:
-        answer = compare_results(folder, question)
-        written = write_answer(folder, answer, figures)
-        content, lines = words.summarize_answer(answer), _format_answer(answer, everything=everything)
-    page = next((str(path) for name, path in written.items() if name.endswith(".html")), None)
+        answered = api.compare_datasets(results, question, figures)
+        content, page = words.summarize_answer(answered.result), answered.page
+        lines = words.format_answer(answered.result, everything=everything)
     lines.append(f"page    {page or _NO_PAGE}")
-    return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
+    answer = {**content, "page": None if page is None else str(page)}
+    return print_result(answer, lambda: lines, json=json, quiet=quiet)
 
 
 _NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"
-_MOST = 3
-"""Differences and notes on the screen without `--all`."""
-_MOST_PAIRS = 10
-"""Pairs on the screen, as many as five datasets have; the page has all."""
-_LEAST_SHARE = 0.01
-"""Share of a budget from which on its cause is named on a screen; the page has all."""
-
-
-def _format_causes(causes: datasets.Causes, *, everything: bool) -> list[str]:
-    lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
-    for budget in causes.budgets:
-        shown = [one for one in budget.parts if everything or abs(one.value) >= _LEAST_SHARE]
-        parts = [f"{causes.names.get(one.name, one.name)} {format_share(one.value, 0)}" for one in shown]
-        rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
-        lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
-    sentences = [one.describe(causes.names) for one in causes.differences]
-    return [
-        *lines,
-        "",
-        *_shorten(sentences, "difference", everything=everything),
-        *_list_notes(causes.notes, everything),
-    ]
-
-
-def _shorten(lines: Sequence[str], what: str, *, everything: bool) -> list[str]:
-    """The lines, or the first ones and how many more there are."""
-    if everything or len(lines) <= _MOST:
-        return list(lines)
-    return [*lines[:_MOST], f"  {format_count(len(lines) - _MOST, f'more {what}')} (--all, page)"]
-
-
-def _list_notes(notes: Sequence[str], everything: bool) -> list[str]:  # noqa: FBT001 - as the option
-    lines = _shorten([f"! {note}" for note in notes], "note", everything=everything)
-    return ["", *lines] if lines else []
-
-
-def _format_answer(answer: datasets.Answer, *, everything: bool) -> list[str]:
-    lines: list[str] = []
-    title = ""
-    for head, about, text in words.list_answer(answer, main_only=not everything):
-        lines += ([""] * bool(lines) + [f"slip of {head}"]) * (head != title)
-        title = head
-        lines.append(f"  {about:<18}{text}")
-    for view in answer.views if everything else ():
-        about = f"{datasets.QUANTITIES[view[1]]}, {INPUT_WORDS[view[0]]}"
-        levels = [
-            (row["dataset"], format_value(row["value"]), _format_ends(row), row["interval"])
-            for row in answer.take(answer.levels, view).sort("value").iter_rows(named=True)
-        ]
-        pairs = [
-            (f"{row['b']} / {row['a']}", words.format_ratio(row, row["b"]), format_value(row["p_adjusted"]))
-            for row in answer.take(answer.comparisons, view)
-            .sort("p_adjusted", nulls_last=True)
-            .iter_rows(named=True)
-        ]
-        lines += ["", *align_rows([(f"{answer.measure} {about}", "m/s", "95 % interval", ""), *levels])]
-        lines += [
-            "",
-            *align_rows([("times as much slip", "ratio", "p adjusted"), *pairs[:_MOST_PAIRS]]),
-        ] * bool(pairs)
-        omitted = len(pairs) - _MOST_PAIRS
-        lines += [f"... and {omitted} more pairs on the page"] * (omitted > 0)
-    others = [
-        INPUT_WORDS[name] for name in dict.fromkeys(one for one, _ in answer.views) if name != answer.input
-    ]
-    rest = ", ".join([*others, "all datasets and pairs with intervals"])
-    lines += [] if everything else ["", f"{rest}: --all, or the page"]
-    return [*lines, *_list_notes(words.list_shown_notes(answer), everything)]
-
-
-def _format_ends(row: Mapping[str, object]) -> str:
-    value, low, high = (row.get(key) for key in ("value", "low", "high"))
-    if not (isinstance(value, float) and isinstance(low, float) and isinstance(high, float)):
-        return "-"
-    return " to ".join(split_interval(value, low, high)[1:])
 
 
 def draw(  # noqa: D417 - arguments document themselves
@@ -195,12 +106,11 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report.datasets_page import write_map  # noqa: PLC0415 - heavy
-
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
-    folder = store.Store(results) if results == Path("results") else open_results(results)
-    drawn = datasets.draw_up_map(folder, deployments, fed=fed, show=show)
-    page = str(write_map(folder, drawn, figures).get("map.html", _NO_PAGE))
+    if results != Path("results"):
+        open_results(results)
+    made = api.draw_map(results, deployments, fed=fed, show=show, figures=figures)
+    drawn, page = made.result, str(made.page or _NO_PAGE)
     content = {
         "deployments": drawn.points.to_dicts(),
         "datasets": drawn.own.to_dicts(),
@@ -209,16 +119,5 @@ def draw(  # noqa: D417 - arguments document themselves
         "notes": list(drawn.notes),
         "page": page,
     }
-    unit = suffix_unit(drawn.measure.unit)
-    lines = [
-        f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
-        f"{drawn.measure.name} {format_value(row['value'])}{unit}"
-        for row in drawn.own.iter_rows(named=True)
-    ]
-    total = drawn.points.height + len(drawn.missing)
-    lines += [f"! {note}" for note in drawn.notes]
-    lines.append(
-        f"page    {page}    ({drawn.points.height} of {total} deployments placed; "
-        f"{drawn.measure.name} {INPUT_WORDS[drawn.input]})"
-    )
+    lines = [*words.format_map(drawn), f"page    {page}    ({words.summarize_map(drawn)})"]
     return print_result(content, lambda: lines, json=json, quiet=quiet)

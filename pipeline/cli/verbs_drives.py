@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline import estimation, models, sources, store
-from pipeline import plan as planning
+from pipeline import api, models
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
@@ -27,10 +25,9 @@ from pipeline.cli.conventions import (
     show_progress,
     spell_choices,
 )
-from pipeline.core import SlipError, align_rows, format_count, format_duration
+from pipeline.core import SlipError, align_rows
 
 if TYPE_CHECKING:
-    from pipeline.analysis import Options
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
 
@@ -75,163 +72,39 @@ def plan(  # noqa: D417 - the runs document themselves
     """
     options = build_options(Choices(vehicle=vehicle, config=config, results=results))
     said = spell_choices(Choices(results=results))
-    at_work = runs[0] if runs else str(check or vehicle or "plan")
-    names = list(runs or [])
+    names, silent = list(runs or []), quiet or json
+    opened, progress = partial(open_shown, quiet=silent), partial(show_progress, quiet=silent)
     if check is not None:
-        return _check(check, names, options, said, json=json, quiet=quiet)
-    from pipeline.report.drive_pages import write_drive  # noqa: PLC0415 - heavy
-
-    seconds = planning.parse_time(time)
-    gathered = _gather(names, options, quiet=quiet or json) if names else None
-    chosen = sources.find_preset(vehicle or "") if gathered is None else gathered.vehicle
-    if chosen is None:
-        known = ", ".join(preset.id for preset in sources.list_presets())
-        what = f"no preset is called {vehicle!r}" if vehicle else "a plan needs a run or a vehicle"
-        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
-    # Report wrong options before a long diagnosis.
-    ground = planning.parse_area(area, chosen)
-    with show_progress(at_work, quiet=quiet or json) as progress:
-        progress("diagnosis")
-        studied, first = planning.Studied(chosen), None
-        if gathered is not None:
-            studied = planning.study(gathered.recordings, chosen, progress)
-            first = gathered.manifests[0]
-        limits = planning.choose_limits(
-            chosen,
-            studied.largest,
-            speed_mps=max_speed,
-            yaw_rate_radps=max_yaw_rate,
-            acceleration_mps2=max_acceleration,
-        )
-        usual = planning.choose_topic(chosen, first)
-        played = (topic or usual[0], type_name or usual[1])
-        made = planning.make_plan(studied, limits, ground, seconds, played, progress)
-    files = write_drive(made, folder, results)
-    shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
+        driven = api.check_drive(check, names, options, opened=opened, progress=progress)
+        following = f"slip plan {shlex.join(dict.fromkeys([*driven.earlier, *names]))}{said}"
+        if json:
+            checked, following_up = driven.checked, following if driven.is_open else None
+            print_json({"kept": checked.outcomes, "open": checked.open, "next": following_up, "errors": []})
+        elif not quiet:
+            print_lines([*driven.describe(), *([f"next      {following}"] if driven.is_open else [])])
+        return LOSSY if driven.lossy else CLEAN
+    made = api.plan_drive(
+        names,
+        options,
+        folder,
+        vehicle=vehicle,
+        time=time,
+        area=area,
+        max_speed=max_speed,
+        max_yaw_rate=max_yaw_rate,
+        max_acceleration=max_acceleration,
+        topic=topic,
+        type_name=type_name,
+        opened=opened,
+        progress=progress,
+    )
+    if made.warning:
+        print_note(f"slip: {made.warning}")
     if json:
-        print_json({**made.to_json(), "files": [str(file) for file in files], "errors": []})
+        print_json({**made.to_json(), "errors": []})
     elif not quiet:
-        print_lines([*format_plan(made, studied.driven_s, files, said), *shown])
-    return LOSSY if gathered is not None and gathered.lossy else CLEAN
-
-
-def _show_in_report(results: Path, manifests: Sequence[store.Manifest], made: planning.Plan) -> list[str]:
-    """Store the plan with its run, if it is for one stored run, and name the report that shows it."""
-    from pipeline.report.drive_pages import leave_plan  # noqa: PLC0415 - heavy
-
-    if len(manifests) != 1:
-        return []
-    try:
-        shown = leave_plan(store.Store(results), manifests[0], made)
-    except (SlipError, OSError) as error:
-        print_note(f"slip: the report of the run does not show the plan: {error}")
-        return []
-    return [f"report       {shown} shows it"] if shown is not None else []
-
-
-class _Gathered(NamedTuple):
-    """Runs of one vehicle, and whether one had losses."""
-
-    vehicle: sources.Vehicle
-    recordings: list[estimation.Recording]
-    manifests: list[store.Manifest]
-    lossy: bool
-
-
-def _gather(
-    names: Sequence[str], options: Options, *, quiet: bool, known: _Gathered | None = None
-) -> _Gathered:
-    """Runs of one vehicle, each once, after those that are known already."""
-    from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
-
-    recordings = [] if known is None else [*known.recordings]
-    manifests = [] if known is None else [*known.manifests]
-    vehicles = [] if known is None else [known.vehicle] * len(recordings)
-    lossy = known is not None and known.lossy
-    for name in names:
-        with open_shown(name, options, quiet=quiet) as opened:
-            vehicle, recording = read_recording(opened.manifest)
-        lossy |= opened.lossy
-        if recording.sha256 and any(recording.sha256 == known.sha256 for known in recordings):
-            continue
-        vehicles.append(vehicle)
-        recordings.append(recording)
-        manifests.append(opened.manifest)
-    if other := next((vehicle for vehicle in vehicles if vehicle != vehicles[0]), None):
-        fields = other.__struct_fields__
-        differing = [name for name in fields if getattr(other, name) != getattr(vehicles[0], name)]
-        what = f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one"
-        where = ", ".join(recording.name for recording in recordings)
-        raise SlipError("several_vehicles", what, where=where, hint="Give runs of one vehicle.")
-    return _Gathered(vehicles[0], recordings, manifests, lossy)
-
-
-def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
-    """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
-    stored = planning.read_plan(path)
-    if not names:
-        what = "a check needs the log that was driven"
-        raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
-    drive = _gather(names, options, quiet=quiet)
-    new = len(drive.recordings)
-    before = [name for name in stored.runs if name not in {*names, *(one.name for one in drive.recordings)}]
-    if stored.vehicle != drive.vehicle.id:
-        what = f"the plan is for {stored.vehicle}, and the log is of {drive.vehicle.id}"
-        hint = "Check a plan with logs of the vehicle it was made for."
-        raise SlipError("other_vehicle", what, where=str(path), hint=hint)
-    vehicle, recordings, _, lossy = _gather(before, options, quiet=quiet, known=drive)
-    with show_progress(names[0], quiet=quiet or json) as progress:
-        progress("diagnosis")
-        driven = [estimation.load_recording(recording, vehicle) for recording in drive.recordings]
-        planning.require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
-        diagnosis = estimation.diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
-    checked = planning.check_plan(stored, diagnosis)
-    following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
-    if json:
-        following_up = following if diagnosis.undecided else None
-        print_json({"kept": checked.outcomes, "open": checked.open, "next": following_up, "errors": []})
-    elif not quiet:
-        rows = [
-            f"{'kept' if one['kept'] else 'NOT KEPT':<9} {one['question']}: "
-            f"promised {one['promised']}, {one['measured']}"
-            for one in checked.outcomes
-        ]
-        rows += [f"open      {text}" for text in checked.open]
-        rows = rows or ["the plan promised nothing"]
-        print_lines([*rows, f"next      {following}"] if diagnosis.undecided else rows)
-    return LOSSY if lossy else CLEAN
-
-
-def format_plan(made: planning.Plan, driven_s: float, files: Sequence[Path], said: str = "") -> list[str]:
-    """The plan on one screen, what it will decide first.
-
-    Args:
-        made: the plan.
-        driven_s: length of the logs so far [s]; 0 without logs.
-        files: the files that were written.
-        said: flags that the next command needs again.
-    """
-    runs = f"after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
-    if not made.questions:
-        return [f"no open question {runs}: no cause is undecided, and each number is known well enough"]
-    ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-    rows = align_rows([(f"open {runs}".strip(), "so far", "with this drive"), *made.list_rows()])
-    most = f"limits       {made.limits.format(steered=made.steered)}"
-    if not made.manoeuvres:
-        nothing = f"no drive on {ground} of level ground answers an open question: no file is written"
-        return [nothing, *(f"  {row}" for row in rows), most]
-    names = [f"{number} x {name}" for name, number in Counter(name for name, _ in made.manoeuvres).items()]
-    return [
-        made.summarize(),
-        *(f"  {row}" for row in rows),
-        f"drive        {made.commands.duration_s:.0f} s on {ground}: {', '.join(names)}",
-        f"place        start in the middle, heading along the length; end within {made.home_m:.1f} m of it",
-        most,
-        f"play         ros2 bag play {files[2]}    # {made.type_name} on {made.topic}",
-        f"page         {files[-1]}",
-        *(f"safety       {text}" for text in planning.SAFETY),
-        f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",
-    ]
+        print_lines(made.describe(said))
+    return LOSSY if made.lossy else CLEAN
 
 
 def simulate(  # noqa: D417 - arguments document themselves

@@ -5,12 +5,11 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline import estimation, models, results, sources, store, words
-from pipeline.analysis import Options
+from pipeline import api, models, results, store, words
 from pipeline.cli.conventions import (
     All,
     Asked,
@@ -28,7 +27,7 @@ from pipeline.cli.conventions import (
     spell_choices,
     spell_flags,
 )
-from pipeline.core import INPUTS, SlipError, pick, resolve_inside
+from pipeline.core import SlipError, pick, resolve_inside
 
 
 def diagnose(  # noqa: D417 - the shared choices document themselves
@@ -66,9 +65,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         models.check_target(apply)
     models.load_effects(effects or ())
     known = None if model is None else models.read_model(model)
-    budget_s = None if budget is None else estimation.parse_budget(budget)
+    budget_s = None if budget is None else api.parse_budget(budget)
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
-    from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
 
     options, silent = build_options(choices), quiet or json
     answers: list[Sequence[results.RunDiagnosis]] = []
@@ -77,17 +75,33 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         {**words.diagnosis_as_json(run), **chosen[run.run]} for runs in answers for run in runs
     ]
     asked.at_work = logs[0]
-    read: dict[str, list[_Read]] = {}
+    read: dict[str, list[api.ReadRun]] = {}
+
+    def warn(text: str) -> None:
+        print_note(f"slip: {text}")
+
     lossy: list[str] = []
     for log in [name for given in logs for name in list_named(given)]:
         with asked.attempt(log), open_shown(log, options, quiet=silent) as opened:
-            one = _Read(opened.manifest, *read_recording(opened.manifest))
+            one = api.read_run(opened.manifest)
             chosen[one.recording.name] = store.read_choices(opened.manifest)
             lossy += [log] * opened.lossy
             read.setdefault(repr(one.vehicle), []).append(one)
     for group in read.values():
         with asked.attempt(group[0].recording.path):
-            answers.append(_judge(group, options, known, vehicle_of, budget_s, quiet=silent))
+            name = group[0].recording.name if len(group) == 1 else f"{len(group)} runs"
+            with show_progress(name, quiet=silent) as progress:
+                answer = api.diagnose_together(
+                    group,
+                    options.out,
+                    inputs=options.inputs,
+                    known=known,
+                    owner=vehicle_of,
+                    budget_s=budget_s,
+                    notify=progress,
+                    warn=None if silent else warn,
+                )
+            answers.append(answer)
     runs = [run for answer in answers for run in answer]
     if apply is not None and runs:
         with asked.attempt(str(apply)):
@@ -110,53 +124,6 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     return exit_code(
         asked.errors, lossy=bool(lossy) or any(results.find_refusal(run.findings) for run in runs)
     )
-
-
-class _Read(NamedTuple):
-    """A run whose tables were read."""
-
-    manifest: store.Manifest
-    vehicle: sources.Vehicle
-    recording: estimation.Recording
-
-
-def _judge(
-    group: Sequence[_Read],
-    options: Options,
-    known: models.ModelFile | None,
-    owner: sources.Owner | None,
-    budget_s: float | None,
-    *,
-    quiet: bool,
-) -> Sequence[results.RunDiagnosis]:
-    """Diagnoses of runs of one vehicle together; a single one with default options is stored, or was."""
-    from pipeline.estimation.stored_diagnosis import find_diagnosis, keep_diagnosis  # noqa: PLC0415 - heavy
-
-    manifest, vehicle, recording = group[0]
-    if known is not None:
-        vehicles = {one.recording.name: vehicle for one in group}
-        vehicle = sources.agree_on_vehicle(known.model.vehicle, vehicles, owner)
-    keeps = known is None and budget_s is None and options.inputs == INPUTS and len(group) == 1
-    if keeps and (stored := find_diagnosis(options.out, manifest)) is not None:
-        return [stored]
-    name = recording.name if len(group) == 1 else f"{len(group)} runs"
-    with show_progress(name, quiet=quiet) as progress:
-        progress("diagnosis")
-        runs = estimation.diagnose_runs(
-            [one.recording for one in group],
-            vehicle,
-            inputs=options.inputs,
-            model=None if known is None else known.model,
-            budget_s=budget_s,
-            notify=progress,
-        ).runs
-    if keeps:
-        try:
-            keep_diagnosis(options.out, manifest, runs[0])
-        except (OSError, SlipError) as error:
-            if not quiet:
-                print_note(f"slip: the diagnosis was not saved: {error}")
-    return runs
 
 
 def _suggest_next(runs: Sequence[results.RunDiagnosis], applying: str, applied: Path | None) -> str:
@@ -199,12 +166,12 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import format_page  # noqa: PLC0415 - heavy
 
     models.load_effects(own or ())
     every = (*models.list_effects(), *models.list_own_effects().values())
     chosen = every if effect is None else (models.find_effect(effect),)
-    pages = models.list_pages(chosen) if effect is None else [format_effect(chosen[0])]
+    pages = models.list_pages(chosen) if effect is None else [format_page(chosen[0])]
     rows = [
         {
             "id": one.id,
@@ -214,7 +181,7 @@ def effects(  # noqa: D417 - the arguments document themselves
             "needs": [need.value for need in one.needs],
             "confused_with": list(one.confused_with),
             "equivalent_to": list(one.equivalent_to),
-            "page": format_effect(one),
+            "page": format_page(one),
         }
         for one in chosen
     ]
@@ -256,7 +223,6 @@ def export(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.estimation.stored_diagnosis import read_slip  # noqa: PLC0415 - heavy
     from pipeline.report.viewer_files import (  # noqa: PLC0415 - heavy
         write_layout,
         write_slip_log,
@@ -270,7 +236,7 @@ def export(  # noqa: D417 - the results folder documents itself
     if to in {"csv", "parquet"}:
         written = write_tables(manifest, to, path)
     elif to == "mcap":
-        written = [write_slip_log(manifest, read_slip(manifest, known), path, frame)]
+        written = [write_slip_log(manifest, api.read_slip(manifest, known), path, frame)]
     else:
         written = [write_layout(to, path)]
     files = [str(each) for each in written]

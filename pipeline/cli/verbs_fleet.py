@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline import datasets, models, store, words
+from pipeline import api, models, words
 from pipeline.cli.conventions import (
     All,
-    Choices,
     OwnEffects,
     Results,
-    build_options,
     open_shown,
     print_json,
     print_lines,
     print_result,
 )
-from pipeline.cli.model_runs import open_model
-from pipeline.core import SlipError, align_rows, format_count, suffix_unit
+from pipeline.core import SlipError
 
 
 def check(  # noqa: D417 - the arguments document themselves
@@ -66,43 +62,29 @@ def check(  # noqa: D417 - the arguments document themselves
         what = "AFTER is a model file, and not what was driven"
         hint = f"Give it first and the log, folder or run second: slip check {after} LOG."
         raise SlipError("after_not_driven", what, where=after, hint=hint)
-    bounds = None if limits is None else datasets.read_limits(limits)
-    known = open_model(Path(before), effects) if Path(before).suffix == ".toml" else None
+    api.load_effects(*(effects or ()))
     silent = quiet or json or (to is not None and file is None)
-    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
-
-    with ExitStack() as stack:
-
-        def open_runs(names: str) -> list[store.Manifest]:
-            asked = replace(build_options(Choices(results=results)), diagnosis=known is None)
-            shown = (open_shown(name, asked, quiet=silent) for name in list_named(names))
-            manifests = [stack.enter_context(one).manifest for one in shown]
-            return list({one.run: one for one in manifests}.values())
-
-        checked = datasets.check_runs(
-            open_runs(before) if known is None else known,
-            open_runs(after),
-            store.Store(results),
-            source=input,
-            owner=vehicle_of,
-            limits=bounds,
-            simulated=simulated,
-        )
+    checked = api.check(
+        before,
+        after,
+        results=results,
+        limits=limits,
+        simulated=simulated,
+        input=input,
+        vehicle_of=vehicle_of,
+        opened=partial(open_shown, quiet=silent),
+    )
     if to is not None:
-        text = {"markdown": words.format_markdown, "junit": words.format_junit}[to](checked)
+        text = checked.to_markdown() if to == "markdown" else checked.to_junit()
         if file is None:
             sys.stdout.write(text)
         else:
             models.write_text(file, text, code="check_unwritable")
     if json:
-        print_json({**words.check_as_json(checked), "errors": []})
+        print_json({**checked.to_json(), "errors": []})
     elif not quiet and (to is None or file is not None):
-        print_lines(words.format_lines(words.list_lines(checked)))
+        print_lines(str(checked).splitlines())
     return checked.code
-
-
-_MOST = 8
-"""Parameters of a vehicle on a screen of 24 lines, those of most runs first."""
 
 
 def build_fleet() -> App:
@@ -134,12 +116,9 @@ def fit(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report.datasets_page import write_fleet  # noqa: PLC0415 - heavy
-
-    folder = store.Store(results)
-    fleet = datasets.fit_results(folder)
-    file = str(write_fleet(folder, fleet)["fleet.parquet"])
-    lines = _format_fleet(fleet, everything=everything)
+    written = api.write_fleet(results)
+    fleet, file = written.result, str(written.files["fleet.parquet"])
+    lines = words.format_fleet(fleet, everything=everything)
     return print_result({**fleet.to_json(), "file": file}, lambda: lines, json=json, quiet=quiet)
 
 
@@ -155,39 +134,10 @@ def show(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    fleet = datasets.fit_results(store.Store(results))
+    fleet = api.read_fleet(results)
     return print_result(
-        fleet.to_json(), lambda: _format_fleet(fleet, everything=everything), json=json, quiet=quiet
+        fleet.to_json(), lambda: words.format_fleet(fleet, everything=everything), json=json, quiet=quiet
     )
-
-
-def _format_fleet(fleet: datasets.Fleet, *, everything: bool) -> list[str]:
-    lines = [fleet.summary]
-    for vehicle, runs in fleet.runs.items():
-        own = [one for one in fleet.numbers if one.vehicle == vehicle]
-        shown = own if everything else own[:_MOST]
-        rows = [("level", "parameter", "value", "95 %", "another run", "unit")]
-        for one in shown:
-            rows.append(
-                (one.level or "open", one.label, *_format_band(one.whole), suffix_unit(one.unit).strip())
-            )
-            is_split = everything or one.level == "terrain"
-            rows += [
-                ("", f"  on {name}", *_format_band(band), "")
-                for name, band in one.terrains.items()
-                if is_split
-            ]
-        lines += ["", f"{vehicle}: {format_count(len(runs), 'run')}", *align_rows(rows)] if own else []
-        hidden = len(own) - len(shown)
-        lines += [f"{format_count(hidden, 'more parameter')}: --all, or the page"] if hidden else []
-        lines += [f"{one.label}: {one.name}, {one.because}" for one in shown if everything]
-    return [*lines, *(f"! {note}" for note in fleet.notes)]
-
-
-def _format_band(band: datasets.Band) -> tuple[str, str, str]:
-    ends = [(band.low, band.high), (band.another_low, band.another_high)]
-    texts = ["-" if low is None or high is None else f"{low:.3g} to {high:.3g}" for low, high in ends]
-    return f"{band.value:.3g}", texts[0], texts[1]
 
 
 def trend(  # noqa: D417 - arguments document themselves
@@ -207,13 +157,8 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.report.datasets_page import write_trend  # noqa: PLC0415 - heavy
-
-    folder = store.Store(results)
-    names = tuple(name.strip() for name in by.split(",") if name.strip())
-    followed = datasets.follow_trend(folder, names)
-    page = write_trend(folder, followed).get("trend.html")
-    content = {**followed.to_json(), "page": None if page is None else str(page)}
-    lines = align_rows([(one.group, one.quantity, one.describe()) for one in followed.series])
-    lines += [f"! {note}" for note in followed.notes] + ([f"page    {page}"] if page else [])
+    followed = api.follow_trend(results, by)
+    page = followed.page
+    content = {**followed.result.to_json(), "page": None if page is None else str(page)}
+    lines = words.format_trend(followed.result) + ([f"page    {page}"] if page else [])
     return print_result(content, lambda: lines, json=json, quiet=quiet)

@@ -121,7 +121,7 @@ _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^\]]*\])?>=([\d.]+)")
 
 
 @dataclass(frozen=True)
-class Check:
+class MachineCheck:
     """Result of one check.
 
     Attributes:
@@ -155,11 +155,11 @@ def doctor(  # noqa: D417 - the results folder documents itself
     return CLEAN if is_well else FAILED
 
 
-def _format_check(check: Check) -> str:
+def _format_check(check: MachineCheck) -> str:
     return f"{check.state:<10}{check.name:<16}{'. '.join(filter(None, (check.text, check.hint)))}"
 
 
-def _look(results: Path) -> Iterator[Check]:
+def _look(results: Path) -> Iterator[MachineCheck]:
     yield _judge(
         "Python",
         f"{sys.version.split()[0]}, {sys.executable}",
@@ -171,7 +171,7 @@ def _look(results: Path) -> Iterator[Check]:
     path = next(filter(None, map(shutil.which, _BROWSERS)), None)
     lacking = "not found; reports and figures do without it"
     hint = "" if path else "For pictures of pages and their tests: make browser"
-    yield Check("Chromium", "ok" if path else "optional", path or lacking, hint)
+    yield MachineCheck("Chromium", "ok" if path else "optional", path or lacking, hint)
     # A missing folder is created in its nearest existing parent.
     parent = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
     free = shutil.disk_usage(parent).free
@@ -184,11 +184,11 @@ def _look(results: Path) -> Iterator[Check]:
     yield _look_at_clock()
 
 
-def _judge(name: str, text: str, hint: str) -> Check:
-    return Check(name, "problem" if hint else "ok", text, hint)
+def _judge(name: str, text: str, hint: str) -> MachineCheck:
+    return MachineCheck(name, "problem" if hint else "ok", text, hint)
 
 
-def _look_at_packages() -> Check:
+def _look_at_packages() -> MachineCheck:
     needed = [
         match.groups()
         for text in metadata.requires(PACKAGE) or ()
@@ -207,7 +207,7 @@ def _look_at_packages() -> Check:
     return _judge("packages", what, "Install slip again, as its handbook says" if wrong else "")
 
 
-def _look_at_extras() -> Check:
+def _look_at_extras() -> MachineCheck:
     lacking: dict[str, str] = {}
     for text in metadata.requires(PACKAGE) or ():
         extra, name = _EXTRA.search(text), _REQUIREMENT.match(text)
@@ -218,9 +218,11 @@ def _look_at_extras() -> Check:
         except metadata.PackageNotFoundError:
             lacking.setdefault(extra[1], name[1])
     if not lacking:
-        return Check("extras", "ok", "all are installed")
+        return MachineCheck("extras", "ok", "all are installed")
     what = f"not installed: {', '.join(f'{extra} ({name})' for extra, name in sorted(lacking.items()))}"
-    return Check("extras", "optional", what, f"For one of them: pip install '{PACKAGE}[{min(lacking)}]'")
+    return MachineCheck(
+        "extras", "optional", what, f"For one of them: pip install '{PACKAGE}[{min(lacking)}]'"
+    )
 
 
 def _read_numbers(version: str) -> list[int]:
@@ -236,34 +238,38 @@ def compile_every_loop() -> int:
     return core.compile_loops()
 
 
-def _look_at_loops() -> Check:
+def _look_at_loops() -> MachineCheck:
     name = "compiled loops"
     count = compile_every_loop()
     caches = core.list_caches()
     if find_spec("numba") is None:
         hint = f"For diagnoses: pip install '{PACKAGE}[diagnose]'"
-        return Check(name, "optional", "Numba is not installed; slip tables do without it", hint)
+        return MachineCheck(name, "optional", "Numba is not installed; slip tables do without it", hint)
     if not caches:
         what = f"{count} loops run as Python, 100 times slower"
-        return Check(name, "problem", what, "Unset NUMBA_DISABLE_JIT")
+        return MachineCheck(name, "problem", what, "Unset NUMBA_DISABLE_JIT")
     if None in caches:
         where = "beside the installation or in the user's cache"
         hint = "Set NUMBA_CACHE_DIR to a folder that you may write to"
-        return Check(name, "problem", f"every process compiles {count} loops: none can be kept {where}", hint)
-    return Check(name, "ok", f"{count} kept in {os.path.commonpath([str(folder) for folder in caches])}")
+        return MachineCheck(
+            name, "problem", f"every process compiles {count} loops: none can be kept {where}", hint
+        )
+    return MachineCheck(
+        name, "ok", f"{count} kept in {os.path.commonpath([str(folder) for folder in caches])}"
+    )
 
 
-def _look_at_permission(folder: Path) -> Check:
+def _look_at_permission(folder: Path) -> MachineCheck:
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         hint = "Give your user the right to write there, or name another folder with --results"
-        return Check("permission", "problem", f"{folder} cannot be written to: {error.strerror}", hint)
-    return Check("permission", "ok", f"{folder} can be written to")
+        return MachineCheck("permission", "problem", f"{folder} cannot be written to: {error.strerror}", hint)
+    return MachineCheck("permission", "ok", f"{folder} can be written to")
 
 
-def _look_at_clock() -> Check:
+def _look_at_clock() -> MachineCheck:
     from zoneinfo import ZoneInfo  # noqa: PLC0415 - only here
 
     named = os.environ.get("TZ", "").removeprefix(":")
@@ -273,5 +279,7 @@ def _look_at_clock() -> Check:
             ZoneInfo(named)
         except (OSError, ValueError, LookupError):
             hint = "Set TZ to a name such as Europe/Berlin, or unset it"
-            return Check("time zone", "problem", f"TZ={named} is not known, times are shown in UTC", hint)
-    return Check("time zone", "ok", f"{zone}; results are in UTC")
+            return MachineCheck(
+                "time zone", "problem", f"TZ={named} is not known, times are shown in UTC", hint
+            )
+    return MachineCheck("time zone", "ok", f"{zone}; results are in UTC")

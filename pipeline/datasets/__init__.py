@@ -9,30 +9,81 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.datasets.causes import Budget, Causes, find_causes
-    from pipeline.datasets.check import Check, Number, check_runs, read_limits
-    from pipeline.datasets.compare import (
-        ABOUT_UNIT,
-        AS_PUBLISHED,
-        EQUAL_DRIVING,
-        QUANTITIES,
-        Answer,
-        compare_results,
-    )
-    from pipeline.datasets.compared_runs import NOT_VALID, Question, find_material
-    from pipeline.datasets.deployments import DeploymentMap, draw_up_map
-    from pipeline.datasets.fleet import Band, Fleet, fit_results
-    from pipeline.datasets.pairs import ALIKE, DIFFERENT, OF_TWO_RUNS, THIS_RUN, UNTESTED, judge_pair
-    from pipeline.datasets.pooling import MEASURES, ComparisonError, gather_runs, pool_runs
-    from pipeline.datasets.stored_fits import (
-        ModelFit,
-        contest_models,
-        expect_model,
-        fit_to_runs,
-        judge_measured,
-        put_on_runs,
-        read_runs,
-    )
-    from pipeline.datasets.trend import Series, Trend, follow_trend
+    from pipeline.datasets.causes import *
+    from pipeline.datasets.check import *
+    from pipeline.datasets.compare import *
+    from pipeline.datasets.compared_runs import *
+    from pipeline.datasets.deployments import *
+    from pipeline.datasets.fleet import *
+    from pipeline.datasets.pairs import *
+    from pipeline.datasets.pooling import *
+    from pipeline.datasets.stored_fits import *
+    from pipeline.datasets.trend import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "causes": (
+                "Budget",
+                "Causes",
+                "find_causes",
+            ),
+            "check": (
+                "RunsCheck",
+                "CheckedNumber",
+                "check_runs",
+                "read_limits",
+            ),
+            "compare": (
+                "ABOUT_UNIT",
+                "AS_PUBLISHED",
+                "EQUAL_DRIVING",
+                "QUANTITIES",
+                "Answer",
+                "compare_results",
+            ),
+            "compared_runs": (
+                "NOT_VALID",
+                "Question",
+                "find_material",
+            ),
+            "deployments": (
+                "DeploymentMap",
+                "draw_up_map",
+            ),
+            "fleet": (
+                "Band",
+                "Fleet",
+                "fit_results",
+            ),
+            "pairs": (
+                "ALIKE",
+                "DIFFERENT",
+                "OF_TWO_RUNS",
+                "THIS_RUN",
+                "UNTESTED",
+                "judge_pair",
+            ),
+            "pooling": (
+                "MEASURES",
+                "ComparisonError",
+                "gather_runs",
+                "pool_runs",
+            ),
+            "stored_fits": (
+                "ModelContest",
+                "ModelFit",
+                "contest_models",
+                "expect_model",
+                "fit_to_runs",
+                "judge_measured",
+                "put_on_runs",
+                "read_runs",
+            ),
+            "trend": (
+                "Series",
+                "Trend",
+                "follow_trend",
+            ),
+        },
+    )

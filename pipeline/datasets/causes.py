@@ -64,7 +64,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Difference:
+class CauseDifference:
     """Difference of the RMS slip of ``b``, which has more, and ``a`` [m/s], by cause, the largest first."""
 
     a: str
@@ -93,7 +93,7 @@ class Causes:
     """Comparison of deployments by cause, on an input; effects have names by their levels."""
 
     budgets: tuple[Budget, ...]
-    differences: tuple[Difference, ...]
+    differences: tuple[CauseDifference, ...]
     input: str
     names: Mapping[str, str]
     keys: tuple[str, ...]
@@ -178,7 +178,7 @@ class _Group:
 
 def compare_causes(
     rows: pl.DataFrame, *, untested: Collection[frozenset[str]] = ()
-) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:
+) -> tuple[tuple[Budget, ...], tuple[CauseDifference, ...]]:
     """The budgets of deployments, and what the differences of two are made of.
 
     A cause that is absent from a run contributes zero there; its slip is part of that run's disturbance.
@@ -235,7 +235,7 @@ def _describe(group: _Group, causes: Sequence[tuple[str, str]]) -> Budget:
     )
 
 
-def _compare(a: _Group, b: _Group, causes: Sequence[tuple[str, str]]) -> Difference:
+def _compare(a: _Group, b: _Group, causes: Sequence[tuple[str, str]]) -> CauseDifference:
     scale = 1.0 / max(math.sqrt(a.mean_square) + math.sqrt(b.mean_square), 1e-300)
     tests = [_test(a, b, index) for index in range(len(causes))]
     adjusted = adjust([p for *_, p in tests])
@@ -253,7 +253,9 @@ def _compare(a: _Group, b: _Group, causes: Sequence[tuple[str, str]]) -> Differe
     ]
     parts.sort(key=lambda part: -abs(part.value))
     total = math.sqrt(b.mean_square) - math.sqrt(a.mean_square)
-    return Difference(a.name, b.name, total, tuple(parts), BLOCKS if a.is_single and b.is_single else RUNS)
+    return CauseDifference(
+        a.name, b.name, total, tuple(parts), BLOCKS if a.is_single and b.is_single else RUNS
+    )
 
 
 def _test(a: _Group, b: _Group, index: int) -> tuple[float, float | None, float | None, float | None]:

@@ -120,7 +120,7 @@ def _find_nonsense(name: str, bound: Bound) -> str:
 
 
 @dataclass(frozen=True)
-class Number:
+class CheckedNumber:
     """One row of a check: a quantity on both sides; unknown numbers are NaN.
 
     Attributes:
@@ -186,7 +186,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedLimit:
     """One limit and its outcome.
 
     Attributes:
@@ -203,7 +203,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Check:
+class RunsCheck:
     """Changes between two sides.
 
     Attributes:
@@ -213,10 +213,10 @@ class Check:
     """
 
     sides: Sides
-    numbers: tuple[Number, ...]
-    limits: tuple[Judged, ...] = ()
+    numbers: tuple[CheckedNumber, ...]
+    limits: tuple[JudgedLimit, ...] = ()
 
-    def list_status(self, status: Status) -> list[Number]:
+    def list_status(self, status: Status) -> list[CheckedNumber]:
         """Numbers of a status."""
         return [one for one in self.numbers if one.status == status]
 
@@ -292,7 +292,7 @@ def check_runs(
     owner: Owner | None = None,
     limits: Limits | None = None,
     simulated: bool = False,
-) -> Check:
+) -> RunsCheck:
     """Test for changes between two sides.
 
     Args:
@@ -312,11 +312,11 @@ def check_runs(
     )
 
 
-def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> Check:
+def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> RunsCheck:
     """Compare two sides that were fitted with one model."""
     pace = math.exp(float(np.mean(np.log([one.pace for one in sides.after]))))
     blank = [
-        Number(
+        CheckedNumber(
             label.name,
             name_number(label.effect.id, label.parameter.name),
             label.parameter.unit,
@@ -324,7 +324,7 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
         )
         for label in sides.labels
     ]
-    blank += [Number(name, _TITLES[name], ERRORS.get(name, "1"), is_ratio=True) for name in LOGARITHMS]
+    blank += [CheckedNumber(name, _TITLES[name], ERRORS.get(name, "1"), is_ratio=True) for name in LOGARITHMS]
     kinds = {label.name: label.parameter for label in sides.labels}
     numbers = []
     for one in blank:
@@ -341,7 +341,7 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
         for one, p in zip(numbers, adjusted, strict=True)
     ]
     judged.sort(key=lambda one: (not one.is_known, one.p_adjusted, one.p if one.is_known else 0.0))
-    check = Check(sides, tuple(judged))
+    check = RunsCheck(sides, tuple(judged))
     return (
         check if limits is None else replace(check, limits=tuple(_judge(limits, check, simulated=simulated)))
     )
@@ -355,7 +355,7 @@ _TITLES = {
 }
 
 
-def _compare(blank: Number, sides: Sides, *, simulated: bool, scale: float = 1.0) -> Number:
+def _compare(blank: CheckedNumber, sides: Sides, *, simulated: bool, scale: float = 1.0) -> CheckedNumber:
     """Compare one quantity of both sides."""
     known = [(group, estimate) for group, run in sides.grouped if (estimate := _read(run, blank.name))]
     counts = {side: sum(group == side for group, _ in known) for side in (BEFORE, AFTER)}
@@ -409,7 +409,7 @@ def _mean(fit: Levels, side: str) -> float:
     return float(fit.means[fit.names.index(side)])
 
 
-def _show(number: Number, value: float, scale: float) -> float:
+def _show(number: CheckedNumber, value: float, scale: float) -> float:
     return scale * math.exp(value) if number.is_ratio else value
 
 
@@ -420,12 +420,12 @@ def _read(run: RunReading, name: str) -> Estimate | None:
     return run.slip if run.terrain == name[len("slip.") :] and math.isfinite(run.slip[1]) else None
 
 
-def _judge(limits: Limits, check: Check, *, simulated: bool) -> Iterator[Judged]:
+def _judge(limits: Limits, check: RunsCheck, *, simulated: bool) -> Iterator[JudgedLimit]:
     """Evaluate every limit, by the intervals of the table."""
     numbers = {one.name: one for one in check.numbers}
     for name, bound in limits.list_bounds():
         if name.startswith("slip."):
-            blank = Number(name, name, "m/s", is_ratio=True)
+            blank = CheckedNumber(name, name, "m/s", is_ratio=True)
             number = _compare(blank, check.sides, simulated=simulated)
             if not math.isfinite(number.after_low):
                 alone = _compare(blank, replace(check.sides, before=check.sides.after), simulated=simulated)
@@ -441,7 +441,7 @@ def _judge(limits: Limits, check: Check, *, simulated: bool) -> Iterator[Judged]
         yield from _judge_number(number, bound, check.sides)
 
 
-def _judge_number(number: Number, bound: Bound, sides: Sides) -> Iterator[Judged]:
+def _judge_number(number: CheckedNumber, bound: Bound, sides: Sides) -> Iterator[JudgedLimit]:
     unit = suffix_unit(number.unit)
     if bound.min is not None or bound.max is not None:
         ends = (number.after_low, number.after_high)
@@ -453,7 +453,7 @@ def _judge_number(number: Number, bound: Bound, sides: Sides) -> Iterator[Judged
         high = math.inf if bound.max is None else bound.max
         parts = [f"at least {bound.min:.3g}"] if bound.min is not None else []
         parts += [f"at most {bound.max:.3g}"] if bound.max is not None else []
-        yield Judged(number.name, f"{' and '.join(parts)}{unit}", text, _judge_ends(ends, low, high))
+        yield JudgedLimit(number.name, f"{' and '.join(parts)}{unit}", text, _judge_ends(ends, low, high))
     if bound.change is not None:
         known = math.isfinite(number.spread)
         ends = (number.low, number.high) if known else (math.nan, math.nan)
@@ -466,7 +466,7 @@ def _judge_number(number: Number, bound: Bound, sides: Sides) -> Iterator[Judged
             limit, low = f"change at most {bound.change:.3g} of {number.before:.3g}", -high
             text = f"{number.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}]{unit}"
         text = text if known else "how much runs differ is not known"
-        yield Judged(number.name, limit, text, _judge_ends(ends, low, high))
+        yield JudgedLimit(number.name, limit, text, _judge_ends(ends, low, high))
 
 
 def _judge_ends(ends: tuple[float, float], low: float, high: float) -> Outcome:
@@ -475,7 +475,7 @@ def _judge_ends(ends: tuple[float, float], low: float, high: float) -> Outcome:
     return "broken" if ends[1] < low or ends[0] > high else "undetermined"
 
 
-def _explain(number: Number, sides: Sides) -> str:
+def _explain(number: CheckedNumber, sides: Sides) -> str:
     """Why a number is not known AFTER; a terrain that no run has is likely misspelt."""
     start, _, ground = number.name.partition(".")
     if start != "slip":

@@ -25,7 +25,7 @@ from pipeline.datasets.pairs import (
     OVER_RUNS,
     THIS_RUN,
     Group,
-    Samples,
+    SlipSamples,
     bound_groups,
     bound_run,
     compare_groups,
@@ -169,9 +169,9 @@ class _Comparison:
             notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
         )
 
-    def _follow_published(self) -> dict[str, Samples]:
+    def _follow_published(self) -> dict[str, SlipSamples]:
         """Window norms of the published processing chain for every run that it applies to."""
-        samples: dict[str, Samples] = {}
+        samples: dict[str, SlipSamples] = {}
         self.notes.append(ABOUT_UNIT)
         for run, manifest in self.compared.manifests.items():
             findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
@@ -195,7 +195,7 @@ class _Comparison:
         self.runs = self.runs.update(medians, on=["run", "input"])
         return samples
 
-    def _group(self, samples: Mapping[str, Samples], name: str, quantity: str) -> list[Group]:
+    def _group(self, samples: Mapping[str, SlipSamples], name: str, quantity: str) -> list[Group]:
         if missing := sorted(set(self.compared.manifests) - set(samples)):
             what = f"no {quantity.replace('_', ' ')} on {name}"
             self.notes.append(f"{', '.join(missing)} not compared: {what}")
@@ -236,7 +236,7 @@ class _Comparison:
         keys = dict(named.group_by("group").agg(pl.col("keyed").sort().str.join(" ")).iter_rows())
         return tabulate_pairs(rows, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
 
-    def _bound_single(self, samples: Mapping[str, Samples], name: str) -> Bounds:
+    def _bound_single(self, samples: Mapping[str, SlipSamples], name: str) -> Bounds:
         """Intervals of runs that are alone in their dataset."""
         alone = self.compared.labels.filter(pl.len().over("group") == 1)["run"]
         ends = {run: bound_run(samples[run]) for run in alone if run in samples}
@@ -291,7 +291,7 @@ class _Comparison:
 
 def _read_samples(
     compared: ComparedRuns, input_name: str, table: str = "slip", time: str = "t", value: str = "modulus"
-) -> dict[str, Samples]:
+) -> dict[str, SlipSamples]:
     """Sound samples of every run on one input: slip moduli by default."""
     frame = (
         compared.scan(table)
@@ -306,10 +306,10 @@ def _read_samples(
     }
 
 
-def _take_samples(times: pl.Series, values: pl.Series) -> Samples:
+def _take_samples(times: pl.Series, values: pl.Series) -> SlipSamples:
     order = times.arg_sort()
     step = float(np.median(np.diff(times[order].to_numpy())))
-    return Samples(values[order].to_numpy(), len(times) * step)
+    return SlipSamples(values[order].to_numpy(), len(times) * step)
 
 
 def _find_families(

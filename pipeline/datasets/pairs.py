@@ -31,7 +31,7 @@ _WORDS = ((0.147, "negligible"), (0.33, "small"), (0.474, "medium"))
 
 
 @dataclass(frozen=True)
-class Samples:
+class SlipSamples:
     """Samples of one run.
 
     Attributes:
@@ -65,11 +65,11 @@ class Group:
 
     name: str
     values: Floats
-    runs: tuple[Samples, ...] = ()
+    runs: tuple[SlipSamples, ...] = ()
     names: tuple[str, ...] = ()
 
     @classmethod
-    def of_runs(cls, name: str, runs: Sequence[Samples]) -> "Group":
+    def of_runs(cls, name: str, runs: Sequence[SlipSamples]) -> "Group":
         """Group whose runs are compared by their medians."""
         return cls(name, np.array([np.median(run.values) for run in runs]), tuple(runs))
 
@@ -90,7 +90,7 @@ def bound_groups(groups: Sequence[Floats]) -> list[tuple[float, float] | None]:
     return [(low, high) if fit.is_known else None for low, high in ends]
 
 
-def bound_run(run: Samples) -> tuple[float, float] | None:
+def bound_run(run: SlipSamples) -> tuple[float, float] | None:
     """Interval of one run's median from its parts; it is of this run, not of its terrain."""
     return bound_groups([_cut_alike([run])[0]])[0]
 
@@ -119,7 +119,7 @@ def _fit_levelled(groups: Sequence[Group], levelled: Levelled) -> Levels:
     return _fit_logarithms([group.values for group in groups], errors)
 
 
-def _cut_alike(runs: Sequence[Samples]) -> list[Floats]:
+def _cut_alike(runs: Sequence[SlipSamples]) -> list[Floats]:
     """Medians of parts of runs, of one length: those of shorter parts scatter more.
 
     The shortest run that can be tested has `PARTS`, or fewer as none is shorter than `STRETCH_S`.

@@ -3,16 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.core import NORMAL_95
+from pipeline.core import NORMAL_95, finite_or_none
 from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.fleet import expect_here
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
-from pipeline.estimation.errors import Errors, errors_as_json
 from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import measure_by_terrain
-from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, note_fit, step_as_json
+from pipeline.estimation.ladder import Ladder, ModelAssessment, assess_model, note_fit
 from pipeline.estimation.odometry_noise import measure_alphas
 from pipeline.estimation.rivals import (
     Contest,
@@ -22,6 +21,7 @@ from pipeline.estimation.rivals import (
 )
 from pipeline.estimation.run_residuals import Input, InputChoice, choose_input
 from pipeline.models import Effect, Model, ModelFile, cut_interval, find_effect, list_models
+from pipeline.results import ERRORS_OVER_2S, Errors, as_written, list_rises, to_json
 from pipeline.run import MotionError, MotionRun, cut_run, find_driven, load_motion_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
 from pipeline.store import Manifest, Store
@@ -49,9 +49,9 @@ class ModelFit:
         return self.after.floor
 
     def explain_refusals(self) -> dict[str, str]:
-        """Reasons why added effects do not reduce the held-out error, by id; empty if they do."""
-        before, after = self.before.whole, self.after.whole
-        return explain_refusals(self.after.data, before, after, lambda: self.file.intervals)
+        """Why added effects would not be accepted, by id; empty where they would."""
+        after = self.after.whole
+        return explain_refusals(after, set(after.effects).difference(self.before.whole.effects))
 
     def prior_as_json(self) -> dict[str, dict[str, object]]:
         """What was known of the numbers before the fit, by label: value, 95 % interval and unit."""
@@ -66,26 +66,32 @@ class ModelFit:
 
     def to_json(self) -> dict[str, object]:
         """The keys of `slip model fit --json` that the fit provides."""
-        data, whole = self.after.data, self.after.whole
+        data, before, after = self.after.data, self.before.whole, self.after.whole
         return {
             "input": self.chosen.source.value,
             "input_reason": self.chosen.reason,
             "runs": list(data.names),
-            "ladder_before": ladder_as_json(self.before.ladder, self.floor),
-            "ladder": ladder_as_json(self.after.ladder, self.floor),
-            "step": step_as_json(self.before.whole, whole),
+            "ladder_before": _list_steps(self.before.ladder, self.floor),
+            "ladder": _list_steps(self.after.ladder, self.floor),
+            "step": {
+                "effects": [list(one.effects) for one in (before, after)],
+                **{
+                    key: [finite_or_none(as_written(one.errors, key)) for one in (before, after)]
+                    for key in ERRORS_OVER_2S
+                },
+                "rises": list(list_rises(before.errors, after.errors)),
+            },
             "refused": self.explain_refusals(),
             "idle": list(self.after.ladder.idle),
             "not_fitted": list(self.chosen.idle),
             "by_run": {
-                name: errors_as_json(errors)
-                for name, errors in zip(data.names, whole.held_out.by_run, strict=True)
+                name: to_json(errors) for name, errors in zip(data.names, after.held_out.by_run, strict=True)
             },
             "by_terrain": {
-                terrain: errors_as_json(errors)
-                for terrain, errors in measure_by_terrain(data, whole.held_out).items()
+                terrain: to_json(errors)
+                for terrain, errors in measure_by_terrain(data, after.held_out).items()
             },
-            "noise_floor": errors_as_json(self.floor),
+            "noise_floor": to_json(self.floor),
             "parameters": parameters_as_json(self.after.fitted.model, self.after.estimates),
             "correlated": correlations_as_json(self.after.estimates),
             "timing": [
@@ -101,6 +107,14 @@ class ModelFit:
                 )
             ],
         }
+
+
+def _list_steps(ladder: Ladder, floor: Errors) -> list[dict[str, object]]:
+    """Steps of a ladder as JSON: the effects first, `rises` where an error rises."""
+    return [
+        {"effects": list(step.effects), **{key: value for key, value in to_json(step).items() if value != []}}
+        for step in ladder.as_result(floor)
+    ]
 
 
 def read_runs(

@@ -10,18 +10,61 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.estimation.diagnose import diagnose_runs, parse_budget
-    from pipeline.estimation.diagnosis import Diagnosis
-    from pipeline.estimation.errors import Errors
-    from pipeline.estimation.estimation_data import EstimationData
-    from pipeline.estimation.held_out import HeldOut, hold_out, score
-    from pipeline.estimation.intervals import Estimates, estimate_intervals
-    from pipeline.estimation.ladder import climb
-    from pipeline.estimation.model_fit import Fitted, fit_model
-    from pipeline.estimation.model_state import Free, ModelState
-    from pipeline.estimation.prediction import Prediction, predict_at, predict_at_from, predict_from
-    from pipeline.estimation.recordings import Recording, load_recording
-    from pipeline.estimation.run_residuals import Input, RunResiduals, choose_input
-    from pipeline.estimation.transfer import carry_over
+    from pipeline.estimation.diagnose import *
+    from pipeline.estimation.diagnosis import *
+    from pipeline.estimation.estimation_data import *
+    from pipeline.estimation.held_out import *
+    from pipeline.estimation.intervals import *
+    from pipeline.estimation.ladder import *
+    from pipeline.estimation.model_fit import *
+    from pipeline.estimation.model_state import *
+    from pipeline.estimation.prediction import *
+    from pipeline.estimation.recordings import *
+    from pipeline.estimation.run_residuals import *
+    from pipeline.estimation.transfer import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "diagnose": (
+                "diagnose_runs",
+                "parse_budget",
+            ),
+            "diagnosis": ("Diagnosis",),
+            "estimation_data": ("EstimationData",),
+            "held_out": (
+                "HeldOut",
+                "hold_out",
+                "score",
+            ),
+            "intervals": (
+                "Estimates",
+                "estimate_intervals",
+            ),
+            "ladder": ("climb",),
+            "model_fit": (
+                "Fitted",
+                "fit_model",
+            ),
+            "model_state": (
+                "Free",
+                "ModelState",
+            ),
+            "prediction": (
+                "Prediction",
+                "predict_at",
+                "predict_at_from",
+                "predict_from",
+            ),
+            "recordings": (
+                "Recording",
+                "load_recording",
+            ),
+            "run_residuals": (
+                "Input",
+                "RunResiduals",
+                "choose_input",
+            ),
+            "transfer": ("carry_over",),
+        },
+    )

@@ -1,37 +1,28 @@
-"""Effects added to a model: which to try next, what each removes, and why one does not help.
-
-The effects of the run's diagnosis come first, then candidates in the order of their evidence.
-"""
+"""What would be accepted next in a model: effects fitted beside its others, and judged as the search does."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import format_share
-from pipeline.estimation.decision import LEAST_T, measure_t
-from pipeline.estimation.errors import Errors
-from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
+from pipeline.estimation.decision import judge
+from pipeline.estimation.ladder import LadderStep, judge_whole
 from pipeline.estimation.matrix import Matrix
-from pipeline.estimation.model_fit import Fitted
 from pipeline.models import Model, explain_idle
-from pipeline.results import CHANCE, format_rises, list_rises
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Collection
 
     from pipeline.core import Floats
     from pipeline.estimation.candidates import Candidate
     from pipeline.estimation.estimation_data import EstimationData
+    from pipeline.estimation.model_fit import Fitted
     from pipeline.models import Conditions, Effect, Parameter
-
-Interval = tuple[float, float]
+    from pipeline.results import Errors
 
 MOST_FITTED = 6
 """Candidates of drivetrain and of ground that are fitted: the gain of others does not justify a fit."""
@@ -48,45 +39,66 @@ class Addition:
         effect: with its values.
         errors: of the model with it.
         remaining: remaining share of the 2 s errors: that of position times that of heading.
-        refusal: why it does not help; None where it helps.
+        refusal: why it would not be accepted; empty where it would.
         twins: ids of effects that reduce the error of the run equally.
-        helps: whether it lowers an error by more than chance.
     """
 
     effect: Effect
     errors: Errors
     remaining: float
-    refusal: str | None = None
+    refusal: str = ""
     twins: tuple[str, ...] = ()
-    helps: bool = True
 
 
-def rank_named(
-    judge: Callable[[Model], Errors], model: Model, before: Errors, named: Sequence[Effect]
-) -> list[Addition]:
-    """What a diagnosis has beyond a model, the largest error reduction first.
-
-    What raises the errors is left out: it may help once others are in the model.
+def weigh_addition(before: LadderStep, after: LadderStep, name: str) -> Addition | None:
+    """An effect as an addition to a fitted model; None where it does not act there.
 
     Args:
-        judge: held-out errors of a model, fitted: what it has once the effect was added.
-        model: the model.
-        before: its errors.
-        named: effects and the suggested formula of the diagnosis, with their values.
+        before: the model without it.
+        after: the model with it.
+        name: its id.
     """
-    additions = []
-    for effect in (one for one in named if one.id not in model):
-        errors = judge(model + effect)
-        if not raises_errors(before, errors):
-            additions.append(
-                Addition(
-                    effect,
-                    errors,
-                    _measure_remaining(before, errors),
-                    helps=lowers_errors(before, errors),
-                )
+    effect = after.fitted.state.find(name)
+    if effect is None:
+        return None
+    refusal = explain_refusals(after, (name,)).get(name, "")
+    return Addition(effect, after.errors, _measure_remaining(before.errors, after.errors), refusal)
+
+
+def explain_refusals(step: LadderStep, names: Collection[str]) -> dict[str, str]:
+    """Why effects of a fitted model would not be accepted beside its others, by id; empty where they would.
+
+    Args:
+        step: the model.
+        names: ids of the effects that are asked.
+    """
+    data = step.fitted.data
+    refusals = dict[str, str]()
+    for fit in step.fitted.fits:
+        asked = [one for one in fit.state.effects if one.id in names and fit.path.owns(one)]
+        matrix = Matrix(fit, (), data.largest) if asked else None
+        for effect in asked:
+            if idle := explain_idle(effect, step.effects):
+                refusals[effect.id] = f"it {idle}"
+            elif matrix is not None and (why := judge(fit, effect, matrix, data.conditions).refusal):
+                refusals[effect.id] = _explain_values(effect, data.conditions) or why
+    return refusals
+
+
+def _explain_values(effect: Effect, conditions: Conditions) -> str:
+    """What is wrong with values that no vehicle has; empty where they could be."""
+    for parameter in effect.parameters:
+        value = effect.values[parameter.name]
+        if parameter.one_sign and value <= parameter.neutral:
+            return (
+                f"{parameter.name} = {_format_value(value, parameter, digits=2)} is not possible: "
+                f"it must be above {_format_value(parameter.neutral, parameter)}"
             )
-    return sorted(additions, key=lambda one: one.remaining)
+    if not effect.is_degenerate(conditions):
+        return ""
+    simpler = effect.collapse()
+    as_what = "it has no effect of its own on this run" if simpler is None else f"it acts as {simpler.id}"
+    return f"with these values {as_what}"
 
 
 def list_promising(data: EstimationData, fitted: Fitted) -> list[Candidate]:
@@ -110,16 +122,20 @@ class Tries:
     Args:
         data: the run.
         model: the current model.
-        suggested: formulas to try beside the catalogue.
+        known: effects and the formula of a diagnosis, with their values, which are tried first.
     """
 
-    def __init__(self, data: EstimationData, model: Model, suggested: Sequence[Effect] = ()) -> None:
+    def __init__(self, data: EstimationData, model: Model, known: Sequence[Effect] = ()) -> None:
         self._data, self._model = data, model
         self._base = judge_whole(data, model)
         self._moves: dict[str, Floats] = {}
         self.before = self._base.errors
+        first = [
+            one for one in data.active_effects(Model(model.vehicle, tuple(known))) if one.id not in model
+        ]
+        ids = {one.id for one in first}
         promising = [candidate() for candidate in list_promising(data, self._base.fitted)]
-        self.candidates = [*promising, *(one for one in suggested if one.id not in model)]
+        self.candidates = [*first, *(one for one in promising if one.id not in ids)]
 
     def try_each(self) -> Iterator[Addition | None]:
         """Each candidate, fitted and judged; None for one that cannot be fitted to this run."""
@@ -129,27 +145,15 @@ class Tries:
             except (MotionError, ArithmeticError, ValueError):
                 yield None
                 continue
-            yield self._judge(candidate.id, after)
-
-    def _judge(self, name: str, after: LadderStep) -> Addition | None:
-        effect = next((one for one in after.fitted.state.effects if one.id == name), None)
-        if effect is None:
-            return None
-        reasons = explain_refusals(
-            self._data,
-            self._base,
-            after,
-            lambda: estimate_intervals(after.fitted).shared_intervals,
-        )
-        remaining, held = _measure_remaining(self.before, after.errors), self._base.held_out.residuals
-        self._moves[name] = _unit(after.held_out.residuals - held, held)
-        return Addition(effect, after.errors, remaining, reasons.get(name))
+            held = self._base.held_out.residuals
+            self._moves[candidate.id] = _unit(after.held_out.residuals - held, held)
+            yield weigh_addition(self._base, after, candidate.id)
 
     def fold(self, additions: Sequence[Addition]) -> list[Addition]:
-        """Helpful effects, largest reduction first; twins are listed under the one with fewest parameters."""
+        """What is accepted, largest reduction first; twins are listed under the one with fewest numbers."""
         folded: list[Addition] = []
-        helping = [one for one in additions if one.refusal is None]
-        for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.remaining)):
+        accepted = [one for one in additions if not one.refusal]
+        for one in sorted(accepted, key=lambda one: (_count_numbers(one.effect), one.remaining)):
             index = next((i for i, other in enumerate(folded) if self._are_twins(one, other)), None)
             if index is None:
                 folded.append(one)
@@ -159,107 +163,6 @@ class Tries:
 
     def _are_twins(self, one: Addition, other: Addition) -> bool:
         return abs(float(self._moves[one.effect.id] @ self._moves[other.effect.id])) > _TWIN
-
-
-def explain_refusals(
-    data: EstimationData,
-    before: LadderStep,
-    after: LadderStep,
-    intervals: Callable[[], Mapping[str, Interval]],
-) -> dict[str, str]:
-    """Reasons why the additional effects of a larger model do not help, by id; empty where they help.
-
-    The first kind of reason is reported: impossible or degenerate values, the errors of all additional
-    effects together, an interval that includes the neutral value.
-
-    Args:
-        data: the runs.
-        before: the smaller model.
-        after: the larger one.
-        intervals: computes the 95 % intervals by label ``effect.parameter``, the slowest step.
-    """
-    added = [effect for effect in after.fitted.model if effect.id not in before.effects]
-    if not added:
-        return {}
-    idle = {one.id: explain_idle(one, after.effects) for one in added}
-    if any(idle.values()):
-        return {name: f"it {text}" for name, text in idle.items() if text}
-    conditions = data.conditions
-    if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
-        return alone
-    t = min(measure_t(fit, one) for one in added for fit in after.fitted.fits if fit.path.owns(one))
-    if together := explain_errors(before.errors, after.errors, t):
-        return dict.fromkeys((one.id for one in added), together)
-    fitted = intervals()
-    return {one.id: why for one in added if (why := explain_refusal(one, fitted))}
-
-
-def explain_errors(
-    before: Errors | Mapping[str, object], after: Errors | Mapping[str, object], t: float
-) -> str | None:
-    """Reason why the held-out errors contradict the addition; None where they support it.
-
-    Args:
-        before: errors without it.
-        after: errors with it.
-        t: standard errors by which its numbers are away from none.
-    """
-    if rises := format_rises(before, after, CHANCE):
-        return rises
-    if not list_rises(after, before, CHANCE):
-        return f"no error over 2 s falls by more than {format_share(CHANCE)}"
-    if t >= LEAST_T:
-        return None
-    return f"the reduction is not significant (t = {t:.1f}, required {LEAST_T:g})"
-
-
-def explain_refusal(
-    effect: Effect, intervals: Mapping[str, Interval], conditions: Conditions | None = None
-) -> str | None:
-    """Reason why an effect with these values does not help a model; None where there is none.
-
-    Args:
-        effect: with its fitted values.
-        intervals: 95 % intervals by label ``effect.parameter``.
-        conditions: what the runs can show; None where that is not known.
-    """
-    for parameter in effect.parameters:
-        value = effect.values[parameter.name]
-        if parameter.one_sign and value <= parameter.neutral:
-            return (
-                f"{parameter.name} = {_format_value(value, parameter, digits=2)} is not possible: "
-                f"it must be above {_format_value(parameter.neutral, parameter)}"
-            )
-    if conditions is not None and effect.is_degenerate(conditions):
-        simpler = effect.collapse()
-        as_what = "it has no effect of its own on this run" if simpler is None else f"it acts as {simpler.id}"
-        return f"with these values {as_what}"
-    return explain_interval(effect, {name: intervals.get(f"{effect.id}.{name}") for name in effect.values})
-
-
-def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -> str | None:
-    """Clause stating that all intervals include the neutral value; None where one does not or none is known.
-
-    Args:
-        effect: with its fitted values.
-        intervals: 95 % intervals by parameter.
-    """
-    known = [
-        (parameter, interval)
-        for parameter in effect.parameters
-        if (interval := intervals.get(parameter.name))
-        and not math.isnan(parameter.neutral)
-        and math.isfinite(interval[1] - interval[0])
-        and interval[1] > interval[0]
-    ]
-    if not known or not all(_holds_neutral(*one) for one in known):
-        return None
-    parameter, (low, high) = known[0]
-    at = _format_value(parameter.neutral, parameter) if math.isfinite(parameter.neutral) else "no limit"
-    return (
-        f"the 95 % interval of {parameter.name}, {low:.3g} to {_format_value(high, parameter)}, "
-        f"includes {at} (no effect)"
-    )
 
 
 def _count_numbers(effect: Effect) -> int:
@@ -278,14 +181,6 @@ def _measure_remaining(before: Errors, after: Errors) -> float:
     """Remaining share of the 2 s errors: that of position times that of heading."""
     position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)
-
-
-def _holds_neutral(parameter: Parameter, interval: Interval) -> bool:
-    """Whether an interval includes the neutral value, which is infinity for a limit."""
-    low, high = interval
-    if math.isfinite(parameter.neutral):
-        return low <= parameter.neutral <= high
-    return math.isinf(parameter.neutral) and low <= parameter.bounds[0]
 
 
 def _format_value(value: float, parameter: Parameter, digits: int = 3) -> str:

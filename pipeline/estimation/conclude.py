@@ -24,7 +24,6 @@ from pipeline.estimation.constancy import find_change
 from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.driving_need import Curve, measure_need, narrow_intervals, thin_growth
 from pipeline.estimation.error_regions import find_main_region, is_narrow, map_errors, pick_regions
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import (
     list_by_run,
     list_estimates,
@@ -32,14 +31,13 @@ from pipeline.estimation.estimates import (
     note_cut,
     was_aligned,
 )
-from pipeline.estimation.ladder import ModelAssessment, assess_model, ladder_as_json, list_order, note_fit
+from pipeline.estimation.ladder import ModelAssessment, assess_model, list_order, note_fit
 from pipeline.estimation.plausibility import measure_moves
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
 from pipeline.results import (
     Delays,
     Detectable,
-    Errors,
     Named,
     PathLadder,
     Region,
@@ -48,7 +46,6 @@ from pipeline.results import (
     Undecided,
     Unexplained,
     Unobservable,
-    read_result,
 )
 from pipeline.run import MotionError
 
@@ -160,8 +157,8 @@ def summarize(
             *note_cut(body.search.budget),
             *(() if assessment is None else find_change(assessment)),
         ),
-        ladder=() if assessment is None else _list_steps(assessment),
-        noise_floor=None if assessment is None else read_result(errors_as_json(assessment.floor), Errors),
+        ladder=() if assessment is None else assessment.ladder.as_result(assessment.floor),
+        noise_floor=None if assessment is None else assessment.floor,
         explained_share=math.nan if last is None else last,
         where=tuple(pick_regions(regions, residual, windows.noise)),
         when=() if assessment is None else find_moments(assessment),
@@ -316,10 +313,6 @@ def _order(named: tuple[Named, ...], assessment: ModelAssessment | None) -> tupl
     return tuple(sorted(named, key=lambda one: [*ranked, one.id].index(one.id)))
 
 
-def _list_steps(assessment: ModelAssessment) -> tuple[Step, ...]:
-    return tuple(read_result(one, Step) for one in ladder_as_json(assessment.ladder, assessment.floor))
-
-
 def _summarize_paths(
     results: Sequence[PathResult], source: Input, measured: ModelAssessment | None
 ) -> dict[str, PathLadder]:
@@ -329,8 +322,8 @@ def _summarize_paths(
     described: dict[str, PathLadder] = {}
     wheels = results[1].outcome
     if source is Input.COMMAND and measured is not None:
-        floor = read_result(errors_as_json(measured.floor), Errors)
-        described["measured"] = PathLadder(measured.fitted.model.ids, _list_steps(measured), floor)
+        steps, floor = measured.ladder.as_result(measured.floor), measured.floor
+        described["measured"] = PathLadder(measured.fitted.model.ids, steps, floor)
     spans = wheels.final.path.spans[:, None]
     steps = tuple(
         Step(

@@ -611,23 +611,29 @@ def judge(
     evidence = np.asarray(np.bincount(path.unit, own), dtype=np.float64)
     t, change = measure_t(fit, effect, base), base.residual - fit.residual
     felt = _find_expected_fall(fit, change)
-    refusal, is_proven = "", False
-    if not any(is_nameable(one, conditions) for one in _list_acting(fit, effect)):
-        refusal = "its values are not possible"
-    elif t < least_t:
-        refusal = f"t = {t:.1f}"
+    refusal, is_proven, acting = "", False, _list_acting(fit, effect)
+    if t < least_t:
+        refusal = f"it is not significant: t = {t:.1f}, required {least_t:.2g}"
+    elif not any(is_nameable(one, conditions) for one in acting):
+        is_small = all(is_too_small(one, conditions) for one in acting)
+        refusal = (
+            "it is smaller than data sheets and stamps err" if is_small else "its values are not possible"
+        )
     elif measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
-        refusal = "its interval holds no effect"
+        refusal = "its 95 % interval includes no effect"
     elif frequency < _SURE:
-        refusal = f"in {format_share(frequency)} of resampled recordings it pays for its numbers"
+        refusal = (
+            f"it pays for its numbers in {format_share(frequency)} of resampled recordings, "
+            f"required {format_share(_SURE)}"
+        )
     elif not gain > 0.0:
-        refusal = "the held-out error does not fall"
+        refusal = "the error on data that it was not fitted to does not fall"
     else:
         is_proven = True
         if felt < SHOWN:
             refusal = f"no error falls by more than {format_share(felt)}"
         elif not _is_material(path, change):
-            refusal = "nobody would notice it"
+            refusal = "what it moves is less than a map resolves"
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
 
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from pipeline.core import Floats, Ints, round_digits
 from pipeline.estimation.intervals import narrow_path
 from pipeline.models import find_effect
-from pipeline.results import INTERVAL_SHARE, DataNeed, Evidence, Growth, Narrowing
+from pipeline.results import INTERVAL_SHARE, DataNeed, GrownEvidence, Growth, Narrowing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ def thin_growth(evidence: Curve | None, widths: Mapping[str, Curve]) -> Growth:
         widths: half-width of the 95 % interval by parameter.
     """
     return Growth(
-        None if evidence is None else Evidence(*_thin(evidence)),
+        None if evidence is None else GrownEvidence(*_thin(evidence)),
         {name: Narrowing(*_thin(one)) for name, one in widths.items()},
     )
 

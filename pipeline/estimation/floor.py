@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from pipeline.core import FOLDS, Floats, robust_spreads
 from pipeline.estimation.evidence import regress
@@ -18,11 +18,11 @@ from pipeline.models import Timing
 from pipeline.run import HORIZON_S, MOVING_MPS, SPAN_S
 
 if TYPE_CHECKING:
-    from pipeline.estimation.errors import Errors
     from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.model_state import ModelState
     from pipeline.estimation.path_residuals import PathResiduals
     from pipeline.estimation.run_residuals import RunResiduals
+    from pipeline.results import Errors
 
 _NEAREST = 25
 """Nearest moments whose mean is taken."""

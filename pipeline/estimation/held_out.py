@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import Flags, Floats, Ints, nearest_indices
-from pipeline.estimation.errors import Errors, measure_errors
+from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.folds import refit
+from pipeline.results import Errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""The ladder: stepwise addition of a model's effects, scored on held-out data, as JSON and text."""
+"""The ladder: stepwise addition of a model's effects, scored on held-out data."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core import JSON_DIGITS, Floats, finite_or_none, pick
-from pipeline.estimation.errors import Errors, errors_as_json, measure_errors
+from pipeline.core import Floats, pick
+from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import HeldOut, hold_out
@@ -20,7 +20,7 @@ from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
 from pipeline.models import Model, ModelFile, Timing
-from pipeline.results import CHANCE, ERRORS_OVER_2S, as_written, list_rises
+from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, Step, as_written, list_rises, to_json
 from pipeline.run import STILL_MPS
 
 _LEAST_ROOM = 0.02
@@ -82,6 +82,15 @@ class Ladder:
         """
         ideal, least = self.steps[0].errors.t_mrmse_m, 0.0 if floor is None else floor.t_mrmse_m
         return tuple(find_share_removed(step.errors.t_mrmse_m, ideal, least) for step in self.steps)
+
+    def as_result(self, floor: Errors | None = None) -> tuple[Step, ...]:
+        """Its steps: their errors, the explained share of the removable error, and which errors rise."""
+        shares = (math.nan if share is None else share for share in self.explained_shares(floor))
+        below = (self.steps[0], *self.steps)
+        return tuple(
+            Step.of(step.errors, step.effects, share, list_rises(before.errors, step.errors))
+            for before, step, share in zip(below, self.steps, shares, strict=False)
+        )
 
 
 def find_share_removed(error: float, ideal: float, floor: float) -> float | None:
@@ -268,7 +277,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     fit: dict[str, object] = {
         "input": data.source.value,
         "blocks": estimates.blocks,
-        "noise_floor": errors_as_json(assessment.floor),
+        "noise_floor": to_json(assessment.floor),
         "runs": [
             {
                 "run": run_residuals.run.name,
@@ -329,35 +338,3 @@ def _measure_driven(data: EstimationData) -> list[dict[str, float]]:
         lower = {LOWER_SPEED: round(float(np.quantile(moving, 0.25)), 4)} if moving.size else {}
         driven.append({DRIVEN_SPEED: round(speed, 4), DRIVEN_TURN: round(turn, 4), **lower})
     return driven
-
-
-def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
-    """Steps with their errors, the removed share of the removable error, and `rises` where an error rises."""
-    rungs: list[dict[str, object]] = []
-    below = ladder.steps[0].errors
-    for step, share in zip(ladder.steps, ladder.explained_shares(floor), strict=True):
-        rises = list_rises(below, step.errors)
-        rungs.append(
-            {
-                "effects": list(step.effects),
-                **errors_as_json(step.errors),
-                "explained_share": None if share is None else _round(share),
-                **({"rises": list(rises)} if rises else {}),
-            }
-        )
-        below = step.errors
-    return rungs
-
-
-def step_as_json(before: LadderStep, after: LadderStep) -> dict[str, object]:
-    """2 s errors of the whole model before and after a change, and which of them rise."""
-    return {
-        "effects": [list(before.effects), list(after.effects)],
-        "t_mrmse_m": [_round(before.errors.t_mrmse_m), _round(after.errors.t_mrmse_m)],
-        "r_mrmse_rad": [_round(before.errors.r_mrmse_rad), _round(after.errors.r_mrmse_rad)],
-        "rises": list(list_rises(before.errors, after.errors)),
-    }
-
-
-def _round(value: float) -> float | None:
-    return finite_or_none(value, JSON_DIGITS)

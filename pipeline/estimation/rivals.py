@@ -24,12 +24,11 @@ from pipeline.core import (
     jackknife_deviation,
     student_quantile,
 )
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, hold_out, number_predictions
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.models import Model
-from pipeline.results import ERRORS_OVER_2S, read_error
+from pipeline.results import ERRORS_OVER_2S, read_error, to_json
 
 if TYPE_CHECKING:
     from pipeline.estimation.held_out import HeldOut
@@ -175,7 +174,7 @@ def contest_as_json(contest: Contest) -> dict[str, object]:
                 "model": rival.name,
                 "numbers": rival.numbers,
                 "fit_s": round(rival.fit_s, 3),
-                "errors": errors_as_json(rival.held_out.pooled),
+                "errors": to_json(rival.held_out.pooled),
                 "behind_best": behind(rival),
             }
             for rival in contest.rivals

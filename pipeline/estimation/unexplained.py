@@ -11,12 +11,11 @@ import numpy as np
 
 from pipeline.estimation.candidates import SHAPES
 from pipeline.estimation.decision import EQUAL, LEAST_T, Search, SearchResult, find_cost
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.fit import fit_path
 from pipeline.estimation.ladder import judge_whole, lowers_errors
 from pipeline.estimation.terms import CHANNELS, is_term, join_formula, list_terms
 from pipeline.models import Timing, format_effect
-from pipeline.results import Disturbance, Errors, Unexplained, read_result
+from pipeline.results import Disturbance, Unexplained
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
@@ -125,7 +124,7 @@ def suggest(
             channels or (channel,),
             assessment.data.source.value,
             formula=format_effect(fitted),
-            with_formula=None if said is None else read_result(errors_as_json(said.errors), Errors),
+            with_formula=None if said is None else said.errors,
         )
         return Suggestion(unexplained, step, said)
     return None

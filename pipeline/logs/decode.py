@@ -39,7 +39,7 @@ Pieces = dict[str, Piece]
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class FieldPlan:
     """A structure with its wanted fields marked.
 
     Attributes:
@@ -48,12 +48,12 @@ class Plan:
     """
 
     structure: Structure
-    wanted: tuple[Plan | bool | None, ...]
+    wanted: tuple[FieldPlan | bool | None, ...]
 
 
-def plan_fields(structure: Structure, paths: set[str], prefix: str = "") -> Plan:
+def plan_fields(structure: Structure, paths: set[str], prefix: str = "") -> FieldPlan:
     """Mark the leaf fields of ``structure`` whose full path is in ``paths``."""
-    marks: list[Plan | bool | None] = []
+    marks: list[FieldPlan | bool | None] = []
     for member in structure.members:
         path = f"{prefix}{member.name}"
         if isinstance(member.element, str):
@@ -62,7 +62,7 @@ def plan_fields(structure: Structure, paths: set[str], prefix: str = "") -> Plan
         below = f"{path}{'[]' if member.count is not None else ''}."
         any_below = any(wanted.startswith(below) for wanted in paths)
         marks.append(plan_fields(member.element, paths, below) if any_below else None)
-    return Plan(structure, tuple(marks))
+    return FieldPlan(structure, tuple(marks))
 
 
 @dataclass(slots=True)
@@ -76,7 +76,7 @@ class Decoder:
         longer: number of accepted rows that are longer than their type.
     """
 
-    plan: Plan
+    plan: FieldPlan
     exact: bool
     vocabularies: dict[str, Vocabulary] = field(default_factory=dict)
     longer: int = 0
@@ -106,13 +106,13 @@ class Decoder:
                 return pieces, cursor.rows
         return {}, cursor.rows
 
-    def _read(self, plan: Plan, cursor: Cursor, prefix: str, out: Pieces) -> None:
+    def _read(self, plan: FieldPlan, cursor: Cursor, prefix: str, out: Pieces) -> None:
         if not plan.structure.members:
             cursor.skip_numbers("uint8", 1)
         for member, wanted in zip(plan.structure.members, plan.wanted, strict=True):
             path = f"{prefix}{member.name}"
             if isinstance(member.element, Structure):
-                below = wanted if isinstance(wanted, Plan) else plan_fields(member.element, set())
+                below = wanted if isinstance(wanted, FieldPlan) else plan_fields(member.element, set())
                 if member.count is None:
                     self._read(below, cursor, f"{path}.", out)
                 else:
@@ -143,7 +143,9 @@ class Decoder:
                 [(rows, Piece(codes)) for rows, codes in codes_of], cursor.base.size, np.empty(0, np.int32)
             )
 
-    def _read_structures(self, member: Member, plan: Plan, cursor: Cursor, prefix: str, out: Pieces) -> None:
+    def _read_structures(
+        self, member: Member, plan: FieldPlan, cursor: Cursor, prefix: str, out: Pieces
+    ) -> None:
         counts = _read_counts(member, cursor, least_size(plan.structure))
         regular = regular_layout(plan.structure, cursor.dialect)
         if regular is not None:
@@ -162,7 +164,7 @@ class Decoder:
             out[path] = join_elements(collected.get(path, []), cursor.base.size, leaf.nothing)
 
     def _read_regular(
-        self, plan: Plan, cursor: Cursor, counts: int | Ints, layout: Regular, prefix: str, out: Pieces
+        self, plan: FieldPlan, cursor: Cursor, counts: int | Ints, layout: Regular, prefix: str, out: Pieces
     ) -> None:
         each = np.full(cursor.base.size, counts, dtype=np.int64) if isinstance(counts, int) else counts
         before = cursor.position
@@ -322,7 +324,7 @@ class Leaf:
     text: bool
 
 
-def wanted_leaves(plan: Plan, prefix: str = "", *, inside: bool = False) -> Iterator[tuple[str, Leaf]]:
+def wanted_leaves(plan: FieldPlan, prefix: str = "", *, inside: bool = False) -> Iterator[tuple[str, Leaf]]:
     """All wanted leaves with their paths.
 
     Args:
@@ -333,7 +335,7 @@ def wanted_leaves(plan: Plan, prefix: str = "", *, inside: bool = False) -> Iter
     for member, mark in zip(plan.structure.members, plan.wanted, strict=True):
         path = f"{prefix}{member.name}"
         several = member.count is not None
-        if isinstance(mark, Plan):
+        if isinstance(mark, FieldPlan):
             below = f"{path}{'[]' if several else ''}."
             yield from wanted_leaves(mark, below, inside=inside or several)
         elif mark and isinstance(member.element, str):

@@ -8,63 +8,102 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.models.catalogue import (
-        draft_effect,
-        explain_idle,
-        find_effect,
-        find_late_effect,
-        is_own,
-        list_effects,
-        list_own_effects,
-        list_pages,
-        load_effects,
-        name_effect,
-        name_number,
-        name_term,
-        refuse_taken,
-        suggest_manoeuvre,
-    )
-    from pipeline.models.effect import (
-        ANY,
-        AddedEffect,
-        Effect,
-        Late,
-        LinearEffect,
-        Place,
-        ReportEffect,
-        find_late,
-    )
-    from pipeline.models.expression import Expression
+    from pipeline.models.catalogue import *
+    from pipeline.models.effect import *
+    from pipeline.models.expression import *
     from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written, list_terms
-    from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-    from pipeline.models.literature import LiteratureModel, find_model, list_literature, list_models
-    from pipeline.models.model import ForwardModel, Model, Timing, replace_context
-    from pipeline.models.model_file import ModelFile, parse_model, read_model
-    from pipeline.models.model_text import (
-        check_target,
-        format_effect,
-        format_model,
-        format_value,
-        write_model,
-        write_text,
-    )
-    from pipeline.models.parameter import (
-        AT_BOUND,
-        EXCEEDED_SHARE,
-        LEAST_DELAY_S,
-        OVERSHOOT,
-        UNDETERMINED,
-        Conditions,
-        Excitation,
-        Largest,
-        Level,
-        Parameter,
-        Quantity,
-        Reading,
-        Search,
-        cut_interval,
-        is_of_one_run,
-        stands_at_bound,
-    )
+    from pipeline.models.formula import *
+    from pipeline.models.literature import *
+    from pipeline.models.model import *
+    from pipeline.models.model_file import *
+    from pipeline.models.model_text import *
+    from pipeline.models.parameter import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "catalogue": (
+                "draft_effect",
+                "explain_idle",
+                "find_effect",
+                "find_late_effect",
+                "is_own",
+                "list_effects",
+                "list_own_effects",
+                "list_pages",
+                "load_effects",
+                "name_effect",
+                "name_number",
+                "name_term",
+                "refuse_taken",
+                "suggest_manoeuvre",
+            ),
+            "effect": (
+                "ANY",
+                "AddedEffect",
+                "Effect",
+                "Late",
+                "LinearEffect",
+                "Place",
+                "ReportEffect",
+                "find_late",
+            ),
+            "expression": ("Expression",),
+            "families": (
+                "Delay",
+                "Filtered",
+                "Lag",
+                "Ramp",
+                "Written",
+                "list_terms",
+            ),
+            "formula": (
+                "CHANNELS",
+                "FormulaEffect",
+                "make_parameter",
+            ),
+            "literature": (
+                "LiteratureModel",
+                "find_model",
+                "list_literature",
+                "list_models",
+            ),
+            "model": (
+                "ForwardModel",
+                "Model",
+                "Timing",
+                "replace_context",
+            ),
+            "model_file": (
+                "ModelFile",
+                "parse_model",
+                "read_model",
+            ),
+            "model_text": (
+                "check_target",
+                "format_effect",
+                "format_model",
+                "format_value",
+                "write_model",
+                "write_text",
+            ),
+            "parameter": (
+                "AT_BOUND",
+                "EXCEEDED_SHARE",
+                "LEAST_DELAY_S",
+                "OVERSHOOT",
+                "UNDETERMINED",
+                "Conditions",
+                "Excitation",
+                "Largest",
+                "Level",
+                "Parameter",
+                "Quantity",
+                "Reading",
+                "Search",
+                "cut_interval",
+                "is_of_one_run",
+                "stands_at_bound",
+            ),
+        },
+    )

@@ -208,7 +208,7 @@ def explain_idle(effect: Effect | EffectClass, ids: Collection[str]) -> str:
     return "" if effect.acts_in(ids) else f"acts only beside {' or '.join(effect.acts_with)}"
 
 
-def format_effect(effect: type[Effect] | Effect) -> str:
+def format_page(effect: type[Effect] | Effect) -> str:
     """An effect's page: docstring, parameters, required excitation, and easily confused effects."""
     if isinstance(effect, FormulaEffect):
         page = effect.describe()

@@ -1,31 +1,33 @@
 """What to drive next: standard manoeuvres that decide what the logs so far leave open."""
 
-from typing import TYPE_CHECKING
-
-from pipeline.door import open_door
-
-if TYPE_CHECKING:
-    from pipeline.plan.manoeuvres import (
-        RATE_HZ,
-        Commands,
-        PlanError,
-        choose_limits,
-        is_steered,
-        join,
-        list_manoeuvres,
-        parse_area,
-        parse_time,
-        wait,
-    )
-    from pipeline.plan.plan import LEAD_S, SAFETY, Plan, make_plan
-    from pipeline.plan.plan_files import (
-        FILES,
-        check_plan,
-        choose_topic,
-        read_plan,
-        require_played,
-        write_plan,
-    )
-    from pipeline.plan.rehearsal import Studied, study
-else:
-    __getattr__ = open_door(__name__, __file__)
+from pipeline.plan.manoeuvres import (
+    RATE_HZ,
+    Commands,
+    PlanError,
+    choose_limits,
+    is_steered,
+    join,
+    list_manoeuvres,
+    parse_area,
+    parse_time,
+    wait,
+)
+from pipeline.plan.plan import (
+    LEAD_S,
+    SAFETY,
+    Plan,
+    make_plan,
+)
+from pipeline.plan.plan_files import (
+    FILES,
+    CheckedPlan,
+    check_plan,
+    choose_topic,
+    read_plan,
+    require_played,
+    write_plan,
+)
+from pipeline.plan.rehearsal import (
+    Studied,
+    study,
+)

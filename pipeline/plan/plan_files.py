@@ -204,7 +204,7 @@ def _format_table(table: Mapping[str, object]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckedPlan:
     """Outcomes of a plan.
 
     Attributes:
@@ -216,7 +216,7 @@ class Check:
     open: tuple[str, ...]
 
 
-def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
+def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> CheckedPlan:
     """Compare what a plan promised with the joint diagnosis of the earlier logs and those of the plan.
 
     An interval is kept if it is as narrow as promised. What else was open is decided if one of the effects is
@@ -251,7 +251,7 @@ def check_plan(plan: StoredPlan, diagnosis: RunDiagnosis) -> Check:
     ]
     hidden = group_by((suggest_drive(name), name) for name in diagnosis.unobservable_why)
     still += [f"{', '.join(names)}: {advice}" for advice, names in hidden.items()]
-    return Check(tuple(outcomes), tuple(still))
+    return CheckedPlan(tuple(outcomes), tuple(still))
 
 
 _ALIKE = 0.6

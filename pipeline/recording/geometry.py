@@ -15,7 +15,7 @@ from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Fit, Motion, Steps
 from pipeline.recording.readings import SIDES, Explained, Reading
-from pipeline.sources import RANGES, DriveForm, find_alike
+from pipeline.sources import RANGES, DriveForm
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _SAME_TRACK = 0.1
@@ -257,7 +257,7 @@ def describe_vehicle(
     track_m = lengths.get("track_width_m")
     radius_m = lengths["wheel_radius_m"]
     name = f"{1e3 * radius_m:.0f}_{0.0 if track_m is None else 1e3 * track_m:.0f}"
-    alike = find_alike(radius_m, track_m) if is_shown and track_m is not None else {}
+    alike = find_alike_vehicles(radius_m, track_m) if is_shown and track_m is not None else {}
     for first, (_, share) in islice(alike.items(), 1):
         is_same = abs(share - 1.0) < _SAME_TRACK
         name = first if is_same else name

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import PathError, read_bounded_text, resolve_inside
-from pipeline.plan import SAFETY, Plan
+from pipeline.plan import FILES, SAFETY, Plan, write_plan
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, set_squares, theme
 from pipeline.report.page import render_figures
 from pipeline.report.theme import (
@@ -198,8 +198,6 @@ def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
     Raises:
         PlanError: as `write_plan`.
     """
-    from pipeline.plan import write_plan  # noqa: PLC0415 - heavy
-
     return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()
 
 
@@ -217,8 +215,6 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     Raises:
         SlipError: the results cannot be written.
     """
-    from pipeline.plan import FILES  # noqa: PLC0415 - heavy
-
     run, results = manifest.run, store.root
     known = store.manifest(run)
     if known is None or known.key != manifest.key:

@@ -122,6 +122,12 @@ def read_suggestion(run: RunDiagnosis, vehicle: Vehicle) -> tuple[Effect, ...]:
     return parse_model(format_model(ModelFile(Model(vehicle))) + text, Path("diagnosis.toml")).model.effects
 
 
+def read_diagnosed(run: RunDiagnosis, vehicle: Vehicle) -> tuple[Effect, ...]:
+    """What a diagnosis names, and the formula that it suggests, with their values."""
+    file = read_model(run)
+    return (*(() if file is None else file.model.effects), *read_suggestion(run, vehicle))
+
+
 def list_added(before: Step, after: Step) -> list[str]:
     """Ids of the effects that a step of the ladder has beyond the one below."""
     return [name for name in after.effects if name not in before.effects]

@@ -89,7 +89,7 @@ class Moves(msgspec.Struct, frozen=True):
     path_share: float
 
 
-class Evidence(msgspec.Struct, frozen=True):
+class GrownEvidence(msgspec.Struct, frozen=True):
     """Evidence `t` for an effect [standard errors] by the seconds of driving."""
 
     seconds: tuple[float, ...] = ()
@@ -111,7 +111,7 @@ class Growth(msgspec.Struct, frozen=True):
         parameters: by parameter.
     """
 
-    evidence: Evidence | None = None
+    evidence: GrownEvidence | None = None
     parameters: dict[str, Narrowing] = {}
 
 
@@ -272,27 +272,40 @@ class Moments(msgspec.Struct, frozen=True):
     run: int = 0
 
 
-class Errors(msgspec.Struct, frozen=True):
-    """Held-out errors of a model.
+class Errors(
+    msgspec.Struct,
+    frozen=True,
+    rename={"t_mean_m": "published_t_mean_m", "r_mean_rad": "published_r_mean_rad"},
+):
+    """Errors of a model.
 
     Attributes:
-        velocity_rms: of the displacement over half a second [m/s, m/s, rad/s].
-        velocity_spread: their interquartile ranges over 1.35.
-        t_mrmse_m, r_mrmse_rad: of position and heading over 2 s.
-        published_t_mean_m, published_r_mean_rad: the published variant.
-        t_median_m, r_median_rad: medians over 2 s.
-        windows: number of predictions over 2 s.
+        velocity_rms: rms of displacement over half a second, over half a second: x, y [m/s], w [rad/s].
+        velocity_spread: 1.4826 times the median size of the same; far below the rms if few stretches
+            contain most of the error.
+        t_mrmse_m: root mean square position error over windows and steps of a 2 s horizon [m].
+        r_mrmse_rad: the same of the wrapped yaw [rad].
+        t_mean_m, r_mean_rad: the published variant: mean of the per-step error norms.
+        t_median_m, r_median_rad: median of the same: the error of a typical prediction.
+        windows: number of windows scored.
     """
 
     velocity_rms: tuple[float, ...] = ()
     velocity_spread: tuple[float, ...] = ()
     t_mrmse_m: float = math.nan
     r_mrmse_rad: float = math.nan
-    published_t_mean_m: float = math.nan
-    published_r_mean_rad: float = math.nan
+    t_mean_m: float = math.nan
+    r_mean_rad: float = math.nan
     t_median_m: float = math.nan
     r_median_rad: float = math.nan
     windows: int = 0
+
+    def ratios(self, other: Errors) -> tuple[float, float, float, float, float]:
+        """Ratios of these errors to others: x, y, w, T, R."""
+        mine = (*self.velocity_rms, self.t_mrmse_m, self.r_mrmse_rad)
+        theirs = (*other.velocity_rms, other.t_mrmse_m, other.r_mrmse_rad)
+        x, y, w, t, r = (a / b if b > 0.0 else math.nan for a, b in zip(mine, theirs, strict=True))
+        return x, y, w, t, r
 
 
 class Step(Errors, frozen=True):
@@ -307,6 +320,19 @@ class Step(Errors, frozen=True):
     effects: tuple[str, ...] = ()
     explained_share: float = math.nan
     rises: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        errors: Errors,
+        effects: tuple[str, ...],
+        explained_share: float = math.nan,
+        rises: tuple[str, ...] = (),
+    ) -> Step:
+        """The errors of a model as a step."""
+        return cls(
+            **msgspec.structs.asdict(errors), effects=effects, explained_share=explained_share, rises=rises
+        )
 
 
 class PathLadder(msgspec.Struct, frozen=True):

@@ -9,85 +9,101 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.sources.candidates import (
-        COMMANDED,
-        CONFIGURED,
-        DEAD_RECKONED,
-        FILTERED,
-        MEASURED,
-        DriveForm,
-        DriveSource,
-        PoseContent,
-        PoseSource,
-        Signal,
-        Sources,
-        is_localization,
-    )
-    from pipeline.sources.configuration import (
-        LENGTH_UNITS,
-        RANGES,
-        UNKNOWN_VEHICLE,
-        Configuration,
-        ConfigurationError,
-        DriveSection,
-        IntervalSection,
-        OutageSection,
-        OwnUnit,
-        PoseSection,
-        StandIn,
-        Vehicle,
-        VehicleSection,
-        VelocitySection,
-        check_geometry,
-        convert_unit,
-        find_preset,
-        list_factors,
-        list_presets,
-        list_ranges,
-        resolve_vehicle,
-    )
-    from pipeline.sources.kinematics import list_kinds
-    from pipeline.sources.layers import (
-        FLEET_FILE,
-        RUN_FILE,
-        Fault,
-        convert,
-        convert_to,
-        is_model,
-        list_configuration_files,
-        load_configuration,
-        merge,
-    )
-    from pipeline.sources.message_types import (
-        MessageType,
-        PoseFields,
-        describe_types,
-        find_type,
-        plain_type,
-        read_tables,
-    )
-    from pipeline.sources.one_vehicle import Owner, agree_on_vehicle, load_vehicle
-    from pipeline.sources.recognition import (
-        Controller,
-        Description,
-        Recognized,
-        VehicleSource,
-        apply_parameters,
-        find_alike,
-        list_contradictions,
-        list_metadata,
-        make_vehicle,
-        read_description,
-        read_frames,
-        read_parameters,
-        recognize_vehicle,
-    )
-    from pipeline.sources.topics import (
-        DEFAULT_INTERVAL,
-        STRING_TYPE,
-        choose_sources,
-        find_pose_fields,
-        list_named,
-    )
+    from pipeline.sources.candidates import *
+    from pipeline.sources.configuration import *
+    from pipeline.sources.kinematics import *
+    from pipeline.sources.layers import *
+    from pipeline.sources.message_types import *
+    from pipeline.sources.one_vehicle import *
+    from pipeline.sources.recognition import *
+    from pipeline.sources.topics import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "candidates": (
+                "COMMANDED",
+                "CONFIGURED",
+                "DEAD_RECKONED",
+                "FILTERED",
+                "MEASURED",
+                "DriveForm",
+                "DriveSource",
+                "PoseContent",
+                "PoseSource",
+                "Signal",
+                "Sources",
+                "is_localization",
+            ),
+            "configuration": (
+                "LENGTH_UNITS",
+                "RANGES",
+                "UNKNOWN_VEHICLE",
+                "Configuration",
+                "ConfigurationError",
+                "DriveSection",
+                "IntervalSection",
+                "OutageSection",
+                "OwnUnit",
+                "PoseSection",
+                "StandIn",
+                "Vehicle",
+                "VehicleSection",
+                "VelocitySection",
+                "check_geometry",
+                "convert_unit",
+                "find_preset",
+                "list_factors",
+                "list_presets",
+                "list_ranges",
+                "resolve_vehicle",
+            ),
+            "kinematics": ("list_kinds",),
+            "layers": (
+                "FLEET_FILE",
+                "RUN_FILE",
+                "Fault",
+                "convert",
+                "convert_to",
+                "is_model",
+                "list_configuration_files",
+                "load_configuration",
+                "merge",
+            ),
+            "message_types": (
+                "MessageType",
+                "PoseFields",
+                "describe_types",
+                "find_type",
+                "plain_type",
+                "read_tables",
+            ),
+            "one_vehicle": (
+                "Owner",
+                "agree_on_vehicle",
+                "load_vehicle",
+            ),
+            "recognition": (
+                "Controller",
+                "Description",
+                "Recognized",
+                "VehicleSource",
+                "apply_parameters",
+                "find_alike_vehicles",
+                "list_contradictions",
+                "list_metadata",
+                "make_vehicle",
+                "read_description",
+                "read_frames",
+                "read_parameters",
+                "recognize_vehicle",
+            ),
+            "topics": (
+                "DEFAULT_INTERVAL",
+                "STRING_TYPE",
+                "choose_sources",
+                "find_pose_fields",
+                "list_named",
+            ),
+        },
+    )

@@ -313,7 +313,7 @@ def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> 
     return vehicle if all(getattr(vehicle, each) is not None for each in required) else None
 
 
-def find_alike(radius_m: float, track_m: float) -> dict[str, tuple[str, float]]:
+def find_alike_vehicles(radius_m: float, track_m: float) -> dict[str, tuple[str, float]]:
     """Platforms with wheels of this radius that may turn as if these stood so far apart, the nearest first.
 
     A skid-steered platform turns less than its wheels ask for, as if its track were wider; none turns more.

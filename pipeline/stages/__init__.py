@@ -9,28 +9,79 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.stages.align import align_tables
-    from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
-    from pipeline.stages.clocks import find_pauses
-    from pipeline.stages.drive import choose_sides, list_steered
-    from pipeline.stages.extract import Extracted, Extraction, Given, extract_tables
-    from pipeline.stages.findings import Finding, Severity, StageError, blame_damage
-    from pipeline.stages.inputs import WINDOW_S
-    from pipeline.stages.lost_messages import number_gaps
-    from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose
-    from pipeline.stages.pose_topics import POSE_FINDINGS, SLOW_HZ, Cut
-    from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
-    from pipeline.stages.slip_stage import (
-        PUBLISHED_SAMPLES,
-        SUMMARY_DIGITS,
-        find_fastest,
-        find_residual_modulus,
-        pick_row,
-        round_number,
-        set_residuals,
-        summarize_inputs,
-    )
-    from pipeline.stages.spans import BLOCK_S, follow_likeliest, price_change
-    from pipeline.stages.trust import ONE_SCALE
+    from pipeline.stages.align import *
+    from pipeline.stages.checks import *
+    from pipeline.stages.clocks import *
+    from pipeline.stages.drive import *
+    from pipeline.stages.extract import *
+    from pipeline.stages.findings import *
+    from pipeline.stages.inputs import *
+    from pipeline.stages.lost_messages import *
+    from pipeline.stages.pose_choice import *
+    from pipeline.stages.pose_topics import *
+    from pipeline.stages.reading import *
+    from pipeline.stages.slip_stage import *
+    from pipeline.stages.spans import *
+    from pipeline.stages.trust import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "align": ("align_tables",),
+            "checks": (
+                "WRONG_RADIUS",
+                "find_gain_of",
+                "is_grip",
+            ),
+            "clocks": ("find_pauses",),
+            "drive": (
+                "choose_sides",
+                "list_steered",
+            ),
+            "extract": (
+                "Extracted",
+                "Extraction",
+                "Given",
+                "extract_tables",
+            ),
+            "findings": (
+                "Finding",
+                "Severity",
+                "StageError",
+                "blame_damage",
+            ),
+            "inputs": ("WINDOW_S",),
+            "lost_messages": ("number_gaps",),
+            "pose_choice": (
+                "PoseRating",
+                "rate_poses",
+                "replace_pose",
+            ),
+            "pose_topics": (
+                "POSE_FINDINGS",
+                "SLOW_HZ",
+                "Cut",
+            ),
+            "reading": (
+                "find_sideways_share",
+                "list_wanted",
+                "with_texts",
+            ),
+            "slip_stage": (
+                "PUBLISHED_SAMPLES",
+                "SUMMARY_DIGITS",
+                "find_fastest",
+                "find_residual_modulus",
+                "pick_row",
+                "round_number",
+                "set_residuals",
+                "summarize_inputs",
+            ),
+            "spans": (
+                "BLOCK_S",
+                "follow_likeliest",
+                "price_change",
+            ),
+            "trust": ("ONE_SCALE",),
+        },
+    )

@@ -12,50 +12,84 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.store.checksums import LOG_NOTES
-    from pipeline.store.files import hold_lock, make_folder, replace_file, temporary_beside
-    from pipeline.store.generation import Generation
-    from pipeline.store.manifests import JSON, MANIFEST, Manifest
-    from pipeline.store.names import (
-        Sample,
-        StoreError,
-        TableEntry,
-        Tally,
-        date_runs,
-        encode_run,
-        name_damage,
-        no_results,
-        path_unread,
-    )
-    from pipeline.store.parquet_tables import (
-        CheckedTable,
-        check_size,
-        check_table,
-    )
-    from pipeline.store.results_folder import Store, list_old
-    from pipeline.store.stored_files import SUMMARY, convert_stored, read_stored
-    from pipeline.store.stored_runs import (
-        ANALYZE_FIRST,
-        DIAGNOSIS,
-        REPORT,
-        UPLOADS,
-        LogIdentities,
-        LogSighting,
-        NoRunsError,
-        find_log,
-        find_recorded_log,
-        find_run,
-        hash_json,
-        lack_runs,
-        locate_beside,
-        name_plainly,
-        name_run,
-        read_choices,
-        read_length_scale,
-        see_log,
-        stored_contexts,
-        stored_keys,
-    )
-    from pipeline.store.verification import RUNS, Examination, Problem
+    from pipeline.store.checksums import *
+    from pipeline.store.files import *
+    from pipeline.store.generation import *
+    from pipeline.store.manifests import *
+    from pipeline.store.names import *
+    from pipeline.store.parquet_tables import *
+    from pipeline.store.results_folder import *
+    from pipeline.store.stored_files import *
+    from pipeline.store.stored_runs import *
+    from pipeline.store.verification import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "checksums": ("LOG_NOTES",),
+            "files": (
+                "hold_lock",
+                "make_folder",
+                "replace_file",
+                "temporary_beside",
+            ),
+            "generation": ("Generation",),
+            "manifests": (
+                "JSON",
+                "MANIFEST",
+                "Manifest",
+            ),
+            "names": (
+                "Sample",
+                "StoreError",
+                "TableEntry",
+                "Tally",
+                "date_runs",
+                "encode_run",
+                "name_damage",
+                "no_results",
+                "path_unread",
+            ),
+            "parquet_tables": (
+                "CheckedTable",
+                "check_size",
+                "check_table",
+            ),
+            "results_folder": (
+                "Store",
+                "list_old",
+            ),
+            "stored_files": (
+                "SUMMARY",
+                "convert_stored",
+                "read_stored",
+            ),
+            "stored_runs": (
+                "ANALYZE_FIRST",
+                "DIAGNOSIS",
+                "REPORT",
+                "UPLOADS",
+                "LogIdentities",
+                "LogSighting",
+                "NoRunsError",
+                "find_log",
+                "find_recorded_log",
+                "find_run",
+                "hash_json",
+                "lack_runs",
+                "locate_beside",
+                "name_plainly",
+                "name_run",
+                "read_choices",
+                "read_length_scale",
+                "see_log",
+                "stored_contexts",
+                "stored_keys",
+            ),
+            "verification": (
+                "RUNS",
+                "Examination",
+                "Problem",
+            ),
+        },
+    )

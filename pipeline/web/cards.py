@@ -4,7 +4,6 @@ import math
 import re
 
 from pipeline.core import split_interval
-from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition
 from pipeline.models import (
     Effect,
@@ -18,6 +17,7 @@ from pipeline.models import (
     refuse_taken,
     stands_at_bound,
 )
+from pipeline.results import Errors
 from pipeline.sources import Vehicle
 from pipeline.web import WorkbenchError
 
@@ -37,7 +37,6 @@ def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str,
     return {
         **describe_effect(effect, model),
         "left": addition.remaining,
-        "helps": addition.helps,
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},
         "to": {"t": after.t_mrmse_m, "r": after.r_mrmse_rad},

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from pipeline.analysis import STAGE_WORDS, STAGES, Options
 from pipeline.analysis.analyze import analyze_log, update_datasets
+from pipeline.api import diagnose_together, read_run
 from pipeline.batch import executors
 from pipeline.batch.batch_work import Entry, Report, Task
-from pipeline.core import INPUTS, SlipError, naming_os_errors, resolve_inside
-from pipeline.estimation.stored_diagnosis import diagnose_stored, keep_diagnosis
+from pipeline.core import SlipError, naming_os_errors, resolve_inside
 from pipeline.store import UPLOADS, LogSighting, Manifest, Store, hold_lock
 from pipeline.web import Limits, WorkbenchError
 from pipeline.web.runs import find_run
@@ -53,7 +53,7 @@ def work(task: Task) -> Report:
     try:
         if task.fingerprint == DIAGNOSE:
             manifest = find_run(store, entry.run)
-            keep_diagnosis(options.out, manifest, diagnose_stored([manifest], INPUTS, None, None, None))
+            diagnose_together([read_run(manifest)], options.out)
             return Report(entry=entry)
         if task.fingerprint == SAMPLE:
             from pipeline.simulate import simulate_case  # noqa: PLC0415 - only for who has no log

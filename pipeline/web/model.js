@@ -114,7 +114,7 @@ const listRows = ({ session, named, trial, diagnosis }) => {
   const rows = named.map((entry) => ({ ...entry, named: true, twins: (equal.get(entry.id) ?? []).filter((name) => name !== entry.id) }));
   const known = new Set([...there, ...rows.map((row) => row.id)]);
   const all = [...rows, ...(trial?.found ?? []).filter((row) => !known.has(row.id))];
-  return all.sort((one, other) => Number(other.helps) - Number(one.helps) || one.left - other.left);
+  return all.sort((one, other) => one.left - other.left);
 };
 
 // Least part of an error that an effect lowers for a model that is at the noise floor already.
@@ -123,7 +123,7 @@ const MATTERS = 0.1;
 // The row to add next; null where nothing lowers the error, or not all that may is known.
 const findNext = (rows, running, done) => {
   const fall = (row) => Math.max(1 - row.to.t / row.from.t, 1 - row.to.r / row.from.r);
-  const best = rows.filter((row) => row.helps && !(done && fall(row) < MATTERS)).sort((one, other) => one.left - other.left)[0] ?? null;
+  const best = rows.filter((row) => !(done && fall(row) < MATTERS)).sort((one, other) => one.left - other.left)[0] ?? null;
   return best && (best.named || !running) ? best : null;
 };
 

@@ -9,12 +9,10 @@ from functools import cached_property, partial
 import numpy as np
 import polars as pl
 
-from pipeline import results
 from pipeline.core import Newest
-from pipeline.estimation import Errors, Estimates, EstimationData, Input, ModelState, choose_input
+from pipeline.estimation import Estimates, EstimationData, Input, ModelState, choose_input
 from pipeline.estimation.apportion import apportion, find_half
 from pipeline.estimation.error_regions import map_errors, pick_regions
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
@@ -22,7 +20,7 @@ from pipeline.estimation.ladder import LadderStep, ModelAssessment, judge_whole,
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Model, ModelFile, Timing
 from pipeline.report.motion_view import MotionStage, MotionView
-from pipeline.results import RunDiagnosis, SlipBudget, list_excess, read_result
+from pipeline.results import Errors, RunDiagnosis, SlipBudget, Step, list_excess
 from pipeline.run import HORIZON_S, MotionRun, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
 from pipeline.store import Manifest
@@ -33,7 +31,7 @@ _MOST_FITS = 60
 
 
 @dataclass(frozen=True)
-class Judged:
+class FittedModel:
     """A fitted model with its held-out errors; its intervals are computed once asked for."""
 
     step: LadderStep
@@ -63,7 +61,7 @@ class PreparedRun:
     data: EstimationData
     stage: MotionStage
     figures: Figures
-    _fits: Newest[Judged] = field(default_factory=lambda: Newest(_MOST_FITS))
+    _fits: Newest[FittedModel] = field(default_factory=lambda: Newest(_MOST_FITS))
 
     @property
     def inputs(self) -> list[str]:
@@ -72,26 +70,26 @@ class PreparedRun:
         return [source.value for source, signals in there.items() if signals is not None]
 
     @cached_property
-    def floor(self) -> results.Errors:
+    def floor(self) -> Errors:
         """The noise floor of the run, by what the ideal model shows."""
-        return read_result(errors_as_json(estimate_floor(self.data)), results.Errors)
+        return estimate_floor(self.data)
 
-    def judge(self, model: Model) -> Judged:
+    def judge(self, model: Model) -> FittedModel:
         """Fit a model and score it on held-out data.
 
         Effects at neutral values are fitted by a search; the others start from their present values.
         """
-        return self._fits.recall(model.effects, lambda: Judged(judge_whole(self.data, model)))
+        return self._fits.recall(model.effects, lambda: FittedModel(judge_whole(self.data, model)))
 
     def measure_errors(self, model: Model) -> Errors:
         """Held-out errors of a model, fitted."""
         return self.judge(model).step.errors
 
-    def remember(self, model: Model, judged: Judged) -> None:
+    def remember(self, model: Model, judged: FittedModel) -> None:
         """Keep the fit of a model also for the model with the fitted values."""
         self._fits.keep(model.effects, judged)
 
-    def find_fit(self, model: Model) -> Judged | None:
+    def find_fit(self, model: Model) -> FittedModel | None:
         """The known fit that gave a model its present values; None if none did."""
         known = self._fits.find(model.effects)
         return (
@@ -110,9 +108,7 @@ class PreparedRun:
         noted = note_fit(file, self._assess(file.model))
         return noted if _list_keys(noted.model) == _list_keys(file.model) else file
 
-    def show(
-        self, model: Model, wheel_delay_s: float, ladder: Sequence[results.Step], floor: results.Errors
-    ) -> Shown:
+    def show(self, model: Model, wheel_delay_s: float, ladder: Sequence[Step], floor: Errors) -> Shown:
         """Prepare a model with its present values for the figures."""
         state = ModelState(model.effects, (Timing(wheel_delay_s),))
         whole, run_residuals = self.data.whole, self.data.residuals_by_run[0]

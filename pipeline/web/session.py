@@ -7,23 +7,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from pipeline import results
-from pipeline.estimation import Errors
-from pipeline.estimation.additions import explain_refusal, explain_refusals, rank_named
-from pipeline.estimation.errors import errors_as_json
+from pipeline.estimation.additions import explain_refusals, weigh_addition
 from pipeline.models import Effect, Model, ModelFile, find_effect, name_term
-from pipeline.results import RunDiagnosis, read_model, read_result, read_suggestion
+from pipeline.results import Errors, RunDiagnosis, Step, read_diagnosed, read_model
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
 from pipeline.web.figures import Shown
-from pipeline.web.prepared import Judged, PreparedRun
+from pipeline.web.prepared import PreparedRun
 from pipeline.words import format_refusals
 
 _MOST_STEPS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
+class Edit:
     """One model of a session with its results.
 
     Attributes:
@@ -43,7 +40,7 @@ class Step:
     order: tuple[str, ...] = ()
     intervals: Mapping[str, tuple[float, float]]
     wheel_delay_s: float = 0.0
-    ladder: tuple[results.Step, ...] = ()
+    ladder: tuple[Step, ...] = ()
     without: Mapping[str, float]
     by_hand: bool = False
     refused: Mapping[str, str]
@@ -62,11 +59,11 @@ class Session:
 
     prepared: PreparedRun
     diagnosis: RunDiagnosis | None
-    steps: tuple[Step, ...]
+    steps: tuple[Edit, ...]
     at: int = 0
 
     @property
-    def step(self) -> Step:
+    def step(self) -> Edit:
         """The current step."""
         return self.steps[self.at]
 
@@ -77,15 +74,14 @@ class Session:
         return [] if file is None else list(file.model)
 
     @cached_property
-    def diagnosed(self) -> list[Effect]:
+    def diagnosed(self) -> tuple[Effect, ...]:
         """What the diagnosis of the run found, its formula too: fits of these effects begin at its values."""
-        vehicle = self.prepared.vehicle
-        return self.named + ([] if self.diagnosis is None else list(read_suggestion(self.diagnosis, vehicle)))
+        return () if self.diagnosis is None else read_diagnosed(self.diagnosis, self.prepared.vehicle)
 
     @property
-    def floor(self) -> results.Errors:
+    def floor(self) -> Errors:
         """The noise floor of the run: that of its diagnosis, else what the ideal model shows."""
-        known: dict[str, results.Errors | None] = {}
+        known: dict[str, Errors | None] = {}
         if self.diagnosis is not None:
             known = {name: one.noise_floor for name, one in self.diagnosis.by_path.items()}
             known[self.diagnosis.input] = self.diagnosis.noise_floor
@@ -106,17 +102,15 @@ class Session:
         return model.swap(*(one for one in known if not model.effect(one.id).fixed))
 
     def list_offers(self) -> list[dict[str, object]]:
-        """What the diagnosis has beyond the model, as JSON, the largest gain first."""
-        prepared, step = self.prepared, self.step
-        file = None if self.diagnosis is None else read_model(self.diagnosis)
-        intervals = {} if file is None else file.intervals
-        missing = (one for one in self.diagnosed if one.id not in step.order)
-        sound = tuple(one for one in missing if explain_refusal(one, intervals) is None)
-        offered = prepared.data.active_effects(Model(prepared.vehicle, sound))
-        before = prepared.score(step.model, step.wheel_delay_s)
-        model = self.begin(step.model)
-        ranked = rank_named(prepared.measure_errors, model, before, offered)
-        return [show_addition(one, before, model) for one in ranked]
+        """What the diagnosis has beyond the model and would be accepted, as JSON, the largest gain first."""
+        prepared, step, model = self.prepared, self.step, self.begin(self.step.model)
+        before = prepared.judge(model).step
+        missing = tuple(one for one in self.diagnosed if one.id not in step.order)
+        active = prepared.data.active_effects(Model(prepared.vehicle, missing))
+        weighed = (weigh_addition(before, prepared.judge(model + one).step, one.id) for one in active)
+        accepted = [one for one in weighed if one is not None and not one.refusal]
+        errors = prepared.score(step.model, step.wheel_delay_s)
+        return [show_addition(one, errors, model) for one in sorted(accepted, key=lambda one: one.remaining)]
 
     def add(self, effects: Sequence[Effect | str], *, anyway: bool = False) -> Session:
         """Add effects to the model at once, and fit the whole model.
@@ -185,7 +179,7 @@ class Session:
         is_fitted = file.model.effects and not self.step.by_hand
         return self.prepared.note_fit(file) if is_fitted else file
 
-    def _push(self, step: Step) -> Session:
+    def _push(self, step: Edit) -> Session:
         steps = (*self.steps[: self.at + 1], step)[-_MOST_STEPS:]
         return replace(self, steps=steps, at=len(steps) - 1)
 
@@ -211,7 +205,7 @@ class Session:
             for count in range(len(shown))
         ]
         delay = judged.step.fitted.state.timing[0].wheel_delay_s
-        changed = Step(
+        changed = Edit(
             said=said,
             model=model.swap(*(one.rounded for one in fitted)),
             order=tuple(order),
@@ -219,12 +213,12 @@ class Session:
             wheel_delay_s=delay,
             ladder=(*below, self._measure(shown, judged.step.errors)),
             without={name: prepared.score(fitted - name, delay).t_mrmse_m for name in shown},
-            refused=self._explain_refusals(judged, shown),
+            refused=explain_refusals(judged.step, shown),
         )
         prepared.remember(changed.model, judged)
         return self._push(changed)
 
-    def _measure(self, effects: tuple[str, ...], errors: Errors) -> results.Step:
+    def _measure(self, effects: tuple[str, ...], errors: Errors) -> Step:
         if not math.isfinite(errors.t_mrmse_m + errors.r_mrmse_rad):
             raise WorkbenchError(
                 "not_finite",
@@ -232,25 +226,11 @@ class Session:
                 where=self.prepared.manifest.run,
                 hint="The model is unchanged; take other values or another formula.",
             )
-        return read_result({**errors_as_json(errors), "effects": list(effects)}, results.Step)
-
-    def _explain_refusals(self, judged: Judged, shown: Sequence[str]) -> dict[str, str]:
-        """Reasons why effects of a fitted model are refused, by id; earlier reasons are preserved."""
-        step, data = self.step, self.prepared.data
-        refusals: dict[str, str] = {}
-        intervals = judged.estimates.shared_intervals
-        if not set(shown) <= set(step.order):
-            before = self.prepared.judge(step.model).step
-            refusals = explain_refusals(data, before, judged.step, lambda: intervals)
-        for name in (name for name in shown if name in step.order):
-            why = explain_refusal(judged.step.fitted.model.effect(name), intervals, data.conditions)
-            if why := why or step.refused.get(name):
-                refusals[name] = why
-        return refusals
+        return Step.of(errors, effects)
 
 
 def open_session(prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Session:
     """A new session with the ideal model, fitted."""
-    step = Step(said="ideal model", model=Model(prepared.vehicle), intervals={}, without={}, refused={})
+    step = Edit(said="ideal model", model=Model(prepared.vehicle), intervals={}, without={}, refused={})
     fitted = Session(prepared, diagnosis, (step,)).fit()
     return Session(prepared, diagnosis, (replace(fitted.step, said=step.said),))

@@ -9,13 +9,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline import results
 from pipeline.core import Newest, SlipError
 from pipeline.estimation import EstimationData
 from pipeline.estimation.additions import Addition, Tries
 from pipeline.estimation.stored_diagnosis import find_diagnosis, read_stored_diagnosis
 from pipeline.models import Model, ModelFile, format_model, write_model
-from pipeline.results import RunDiagnosis
+from pipeline.results import Errors, RunDiagnosis, as_written
 from pipeline.store import DIAGNOSIS, Manifest, Store, StoreError, locate_beside, make_folder
 from pipeline.web import Ask, Slot, WorkbenchError, evaluating
 from pipeline.web.cards import describe_effect, list_catalogue, make_formula, show_addition, show_parameter
@@ -266,5 +265,5 @@ def show_card(session: Session, name: str) -> dict[str, object]:
     }
 
 
-def _errors(step: results.Errors) -> dict[str, float]:
-    return {"t": step.t_mrmse_m, "r": step.r_mrmse_rad}
+def _errors(errors: Errors) -> dict[str, float]:
+    return {"t": as_written(errors, "t_mrmse_m"), "r": as_written(errors, "r_mrmse_rad")}

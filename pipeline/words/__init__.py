@@ -10,50 +10,82 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.words.check import check_as_json, format_junit, format_markdown, list_lines
-    from pipeline.words.comparison import format_ratio, list_answer, list_shown_notes, summarize_answer
-    from pipeline.words.diagnosis import (
-        VERDICT,
-        describe,
-        format_lines,
-        format_short,
-        format_suggestion,
-        list_findings,
-        list_largest_falls,
-        list_terms,
-    )
-    from pipeline.words.effects import (
-        describe_cause,
-        describe_clause,
-        describe_motion,
-        describe_separation,
-        name_group,
-        suggest_drive,
-    )
-    from pipeline.words.errors import (
-        describe_end,
-        describe_need,
-        describe_region,
-        describe_regions,
-        describe_rest,
-        describe_unexplained,
-        format_remaining_error,
-        name_span,
-    )
-    from pipeline.words.findings import format_finding
-    from pipeline.words.models import (
-        describe_step,
-        format_contest,
-        format_heads,
-        format_ladder,
-        format_measured_errors,
-        format_parameters,
-        format_recordings,
-        format_refusals,
-        format_speed_limits,
-        suggest_export,
-    )
-    from pipeline.words.objects import diagnosis_as_json
-    from pipeline.words.verdict import format_refusal, format_verdict
+    from pipeline.words.check import *
+    from pipeline.words.comparison import *
+    from pipeline.words.diagnosis import *
+    from pipeline.words.effects import *
+    from pipeline.words.errors import *
+    from pipeline.words.findings import *
+    from pipeline.words.fleet import *
+    from pipeline.words.models import *
+    from pipeline.words.objects import *
+    from pipeline.words.verdict import *
 else:
-    __getattr__ = open_door(__name__, __file__)
+    __getattr__ = open_door(
+        __name__,
+        {
+            "check": (
+                "check_as_json",
+                "format_junit",
+                "format_markdown",
+                "list_check_lines",
+            ),
+            "comparison": (
+                "format_answer",
+                "format_causes",
+                "list_answer",
+                "list_shown_notes",
+                "summarize_answer",
+            ),
+            "diagnosis": (
+                "VERDICT",
+                "describe",
+                "format_lines",
+                "format_short",
+                "format_suggestion",
+                "list_findings",
+                "list_largest_falls",
+                "list_terms",
+            ),
+            "effects": (
+                "describe_cause",
+                "describe_clause",
+                "describe_motion",
+                "describe_separation",
+                "name_group",
+                "suggest_drive",
+            ),
+            "errors": (
+                "describe_end",
+                "describe_need",
+                "describe_region",
+                "describe_regions",
+                "describe_rest",
+                "describe_unexplained",
+                "format_remaining_error",
+                "name_span",
+            ),
+            "findings": ("format_finding",),
+            "fleet": (
+                "format_fleet",
+                "format_map",
+                "format_trend",
+                "summarize_map",
+            ),
+            "models": (
+                "format_change",
+                "format_contest",
+                "format_ladder",
+                "format_parameters",
+                "format_refusals",
+                "format_speed_limits",
+                "format_transfers",
+                "suggest_export",
+            ),
+            "objects": ("diagnosis_as_json",),
+            "verdict": (
+                "format_refusal",
+                "format_verdict",
+            ),
+        },
+    )

@@ -14,7 +14,7 @@ from pipeline.core import (
     split_interval,
     suffix_unit,
 )
-from pipeline.datasets import Check, Number
+from pipeline.datasets import CheckedNumber, RunsCheck
 
 Line = tuple[str, str]
 _MOST = 3
@@ -25,7 +25,7 @@ _ONE_RUN = (
 )
 
 
-def format_verdict(check: Check) -> str:
+def format_check(check: RunsCheck) -> str:
     """What changed, and whether it is more than runs differ, in one to three sentences."""
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
@@ -57,18 +57,18 @@ def format_verdict(check: Check) -> str:
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
 
-def _list(numbers: list[Number]) -> str:
+def _list(numbers: list[CheckedNumber]) -> str:
     others = [f"{len(numbers) - _MOST} more"] if len(numbers) > _MOST else []
     return enumerate_texts([*map(describe_change, numbers[:_MOST]), *others])
 
 
-def describe_change(number: Number) -> str:
+def describe_change(number: CheckedNumber) -> str:
     """A change in words: what, from where to where, and its p over all numbers."""
     p = f"p = {number.p_adjusted:.1g}" if number.p_adjusted >= 1e-4 else "p < 0.0001"  # noqa: PLR2004 - as many digits as are shown
     return f"{number.title} {_format(number, number.before)} -> {_format(number, number.after)} ({p})"
 
 
-def _format(number: Number, value: float) -> str:
+def _format(number: CheckedNumber, value: float) -> str:
     if not math.isfinite(value):
         return "-"
     if number.is_ratio and number.unit != "1":
@@ -76,7 +76,7 @@ def _format(number: Number, value: float) -> str:
     return f"{value:.3g}{suffix_unit(number.unit)}"
 
 
-def tabulate_check(check: Check) -> list[tuple[str, ...]]:
+def tabulate_check(check: RunsCheck) -> list[tuple[str, ...]]:
     """The table of a check: a head, then a row a number; differences of shares are in percent."""
     rows = []
     for one in check.numbers:
@@ -93,9 +93,9 @@ def tabulate_check(check: Check) -> list[tuple[str, ...]]:
     return [_HEAD, *rows]
 
 
-def list_lines(check: Check) -> list[Line]:
+def list_check_lines(check: RunsCheck) -> list[Line]:
     """The check as labels and texts: verdict, limits, the table, compared runs, notes."""
-    lines = [("verdict", format_verdict(check))]
+    lines = [("verdict", format_check(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     table = tabulate_check(check)
     lines += [(row[0], text) for row, text in zip(table, align_rows([row[1:] for row in table]), strict=True)]
@@ -111,11 +111,11 @@ def list_lines(check: Check) -> list[Line]:
     return lines + [("note", note) for note in sides.notes]
 
 
-def format_markdown(check: Check) -> str:
+def format_markdown(check: RunsCheck) -> str:
     """The check as Markdown: verdict, limits, and the table of the screen."""
     limits = [("limit", "measured", "outcome")]
     limits += [(f"{one.name}: {one.limit}", one.measured, one.outcome) for one in check.limits]
-    parts = [f"**{_escape(format_verdict(check))}**"]
+    parts = [f"**{_escape(format_check(check))}**"]
     for head, *rows in (limits, tabulate_check(check)):
         if rows:
             lines = [head, ["---"] * len(head), *([*map(_escape, row)] for row in rows)]
@@ -130,7 +130,7 @@ def _escape(text: str) -> str:
     return escaped.replace("<", "&lt;").replace(">", "&gt;")
 
 
-def format_junit(check: Check) -> str:
+def format_junit(check: RunsCheck) -> str:
     """The check as JUnit: one case per limit and number; changed or broken ones fail, open ones skip.
 
     If limits are given, changed numbers do not fail: the limits decide, as for the exit code.
@@ -159,12 +159,12 @@ def format_junit(check: Check) -> str:
         case = ET.SubElement(suite, "testcase", classname=f"slip.check.{group}", name=make_plain(name))
         if outcome in kinds:
             ET.SubElement(case, kinds[outcome], message=make_plain(text))
-    ET.SubElement(suite, "system-out").text = make_plain(format_verdict(check))
+    ET.SubElement(suite, "system-out").text = make_plain(format_check(check))
     ET.indent(suite)
     return f'<?xml version="1.0" encoding="utf-8"?>\n{ET.tostring(suite, encoding="unicode")}\n'
 
 
-def check_as_json(check: Check) -> dict[str, object]:
+def check_as_json(check: RunsCheck) -> dict[str, object]:
     """The JSON object of `slip check`."""
     sentences = [f"{describe_change(one)}." for one in check.list_status("changed")]
-    return check.to_json(format_verdict(check), sentences)
+    return check.to_json(format_check(check), sentences)

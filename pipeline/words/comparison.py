@@ -1,10 +1,18 @@
 """The answer of a comparison in sentences: which ground is harder, as driven and at equal driving."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_count, format_two, number_in
+from pipeline.core import (
+    INPUT_WORDS,
+    align_rows,
+    format_count,
+    format_share,
+    format_two,
+    number_in,
+    split_interval,
+)
 from pipeline.datasets import (
     ALIKE,
     DIFFERENT,
@@ -14,6 +22,7 @@ from pipeline.datasets import (
     QUANTITIES,
     UNTESTED,
     Answer,
+    Causes,
     judge_pair,
 )
 
@@ -113,3 +122,96 @@ def _list_rows(frame: pl.DataFrame) -> list[dict[str, object]]:
         if "a" in frame.columns
         else plain.to_dicts()
     )
+
+
+_MOST = 3
+"""Differences and notes on the screen without `--all`."""
+_MOST_PAIRS = 10
+"""Pairs on the screen, as many as five datasets have; the page has all."""
+_LEAST_SHARE = 0.01
+"""Share of a budget from which on its cause is named on a screen; the page has all."""
+
+
+def format_causes(causes: Causes, *, everything: bool) -> list[str]:
+    """What the causes of slip contribute, and to the differences, on one screen.
+
+    Args:
+        causes: budgets of datasets side by side.
+        everything: also small causes, and all differences and notes.
+    """
+    lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
+    for budget in causes.budgets:
+        shown = [one for one in budget.parts if everything or abs(one.value) >= _LEAST_SHARE]
+        parts = [f"{causes.names.get(one.name, one.name)} {format_share(one.value, 0)}" for one in shown]
+        rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
+        lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
+    sentences = [one.describe(causes.names) for one in causes.differences]
+    return [
+        *lines,
+        "",
+        *_shorten(sentences, "difference", everything=everything),
+        *_list_notes(causes.notes, everything),
+    ]
+
+
+def _shorten(lines: Sequence[str], what: str, *, everything: bool) -> list[str]:
+    """The lines, or the first ones and how many more there are."""
+    if everything or len(lines) <= _MOST:
+        return list(lines)
+    return [*lines[:_MOST], f"  {format_count(len(lines) - _MOST, f'more {what}')} (--all, page)"]
+
+
+def _list_notes(notes: Sequence[str], everything: bool) -> list[str]:  # noqa: FBT001 - as the option
+    lines = _shorten([f"! {note}" for note in notes], "note", everything=everything)
+    return ["", *lines] if lines else []
+
+
+def format_answer(answer: Answer, *, everything: bool) -> list[str]:
+    """Which dataset is harder, on one screen.
+
+    Args:
+        answer: the comparison.
+        everything: also the tables of datasets and pairs, and all notes.
+    """
+    lines: list[str] = []
+    title = ""
+    for head, about, text in list_answer(answer, main_only=not everything):
+        lines += ([""] * bool(lines) + [f"slip of {head}"]) * (head != title)
+        title = head
+        lines.append(f"  {about:<18}{text}")
+    for view in answer.views if everything else ():
+        about = f"{QUANTITIES[view[1]]}, {INPUT_WORDS[view[0]]}"
+        levels = [
+            (row["dataset"], _format_cell(row["value"]), _format_ends(row), row["interval"])
+            for row in answer.take(answer.levels, view).sort("value").iter_rows(named=True)
+        ]
+        pairs = [
+            (f"{row['b']} / {row['a']}", format_ratio(row, row["b"]), _format_cell(row["p_adjusted"]))
+            for row in answer.take(answer.comparisons, view)
+            .sort("p_adjusted", nulls_last=True)
+            .iter_rows(named=True)
+        ]
+        lines += ["", *align_rows([(f"{answer.measure} {about}", "m/s", "95 % interval", ""), *levels])]
+        lines += [
+            "",
+            *align_rows([("times as much slip", "ratio", "p adjusted"), *pairs[:_MOST_PAIRS]]),
+        ] * bool(pairs)
+        omitted = len(pairs) - _MOST_PAIRS
+        lines += [f"... and {omitted} more pairs on the page"] * (omitted > 0)
+    others = [
+        INPUT_WORDS[name] for name in dict.fromkeys(one for one, _ in answer.views) if name != answer.input
+    ]
+    rest = ", ".join([*others, "all datasets and pairs with intervals"])
+    lines += [] if everything else ["", f"{rest}: --all, or the page"]
+    return [*lines, *_list_notes(list_shown_notes(answer), everything)]
+
+
+def _format_cell(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, int | float) else "-"
+
+
+def _format_ends(row: Mapping[str, object]) -> str:
+    value, low, high = (row.get(key) for key in ("value", "low", "high"))
+    if not (isinstance(value, float) and isinstance(low, float) and isinstance(high, float)):
+        return "-"
+    return " to ".join(split_interval(value, low, high)[1:])

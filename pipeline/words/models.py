@@ -4,8 +4,10 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from pipeline.core import (
+    INPUT_WORDS,
     format_angle,
     format_count,
     format_digits,
@@ -14,12 +16,14 @@ from pipeline.core import (
     number_in,
     split_interval,
 )
-from pipeline.estimation.errors import Errors
+from pipeline.datasets import ModelFit
+from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
+from pipeline.estimation.transfer import Transfer
 from pipeline.models import AT_BOUND, UNDETERMINED
-from pipeline.results import CHANCE, ERRORS_OVER_2S, format_rises
+from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, format_rises
 from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall
 
@@ -208,3 +212,38 @@ def format_refusals(refusals: Mapping[str, str]) -> str:
     said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
     verb = "is" if len(refusals) == 1 else "are"
     return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
+
+
+def format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
+    """The ladders of a model before and after a change, and its parameters.
+
+    Args:
+        fit: the model on runs.
+        refusals: reasons against added effects, by id.
+    """
+    old, new, chosen = fit.before, fit.after, fit.chosen
+    runs = ", ".join(new.data.names)
+    lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
+    lines += format_recordings([run_residuals.run for run_residuals in new.data.residuals_by_run])
+    if old is not new:
+        lines += ["", "before", *format_ladder(old.ladder, fit.floor), "", "after"]
+    lines += format_ladder(new.ladder, fit.floor)
+    if old is not new:
+        lines += describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
+    if chosen.warning:
+        lines.append(chosen.warning)
+    parameters = parameters_as_json(new.fitted.model, new.estimates)
+    prior = fit.prior_as_json()
+    lines += ["", "parameters", *format_parameters(parameters)]
+    return [*lines, "", "prior", *format_parameters(prior)] if prior else lines
+
+
+def format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
+    """Errors of models on runs that they were not fitted on, by the name of the model."""
+    lines = list(format_heads("held-out error of"))
+    for name, item in rows:
+        lines.append(format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
+        lines.append(format_measured_errors(f"  {Path(name).name} as given", item.carried.pooled))
+        lines.append(format_measured_errors("  refitted to this run", item.own.pooled))
+        lines.append(f"  error as given over error refitted: {item.ratio:.2f}")
+    return lines

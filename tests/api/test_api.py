@@ -92,7 +92,7 @@ def test_what_the_analysis_found_is_not_looked_for_again(
 ) -> None:
     where = {"results": find_results(run), "report": False}
     again = slip.analyze(str(run.summary["log"]["path"]), **where)  # type: ignore[index, arg-type]
-    monkeypatch.setattr("pipeline.api.diagnose_stored", None)
+    monkeypatch.setattr("pipeline.api.diagnoses.diagnose_runs", None)
     assert as_json(again.diagnose().to_json()) == as_json(diagnosis.to_json())
     assert repr(again.diagnose()) == repr(diagnosis)
 

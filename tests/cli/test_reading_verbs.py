@@ -187,7 +187,7 @@ def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_ta
         searches.append(1)
         return diagnose_runs(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("pipeline.estimation.diagnose_runs", count)
+    monkeypatch.setattr("pipeline.api.diagnoses.diagnose_runs", count)
     runs = hash_tree(out / "runs")
     screens, models, told = [], [], []
     for number in range(3):

@@ -10,7 +10,15 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.datasets import ComparisonError
-from pipeline.datasets.check import BROKEN, KEPT, UNDETERMINED, Check, Number, compare_sides, read_limits
+from pipeline.datasets.check import (
+    BROKEN,
+    KEPT,
+    UNDETERMINED,
+    CheckedNumber,
+    RunsCheck,
+    compare_sides,
+    read_limits,
+)
 from pipeline.datasets.check_readings import MULTIPLIER, POSITION_ERROR, RunReading
 from pipeline.datasets.check_sides import Sides, read_under, unite_effects
 from pipeline.models.catalogue import find_effect
@@ -18,7 +26,7 @@ from pipeline.models.effect import Effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.run import MotionRun
-from pipeline.words.check import check_as_json, format_junit, format_markdown, format_verdict, list_lines
+from pipeline.words.check import check_as_json, format_check, format_junit, format_markdown, list_check_lines
 
 USUAL = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": 1.6}}
 LATE = {**USUAL, "drive_lag": {"tau": 0.45}}
@@ -53,7 +61,7 @@ def same(model: ModelFile, late: Sides) -> Sides:
     return replace(late, after=read_under(model, ((), drive(USUAL, 30))).after)
 
 
-def find(check: Check, name: str) -> Number:
+def find(check: RunsCheck, name: str) -> CheckedNumber:
     return next(one for one in check.numbers if one.name == name)
 
 
@@ -66,14 +74,14 @@ def test_the_number_that_changed_is_named_and_the_others_are_not(late: Sides) ->
     assert lag.low < 0.15 < lag.high
     assert lag.freedom == 4
     assert found.code == BROKEN
-    assert format_verdict(found).startswith("Changed: lag of the drive 0.")
+    assert format_check(found).startswith("Changed: lag of the drive 0.")
 
 
 def test_nothing_is_called_a_change_where_nothing_changed(same: Sides) -> None:
     found = compare_sides(same)
 
     assert found.code == KEPT
-    assert format_verdict(found).startswith("No change shown in 4 numbers.")
+    assert format_check(found).startswith("No change shown in 4 numbers.")
     lag = find(found, LAG)
     assert 0.0 < lag.smallest < 0.1
     assert lag.low < 0.0 < lag.high
@@ -87,7 +95,7 @@ def test_a_check_in_which_most_numbers_are_unknown_shows_nothing(same: Sides) ->
 
     blind = compare_sides(replace(same, after=tuple(map(hide, same.after))))
     assert blind.code == UNDETERMINED
-    assert "most parameters of the model cannot be compared" in format_verdict(blind)
+    assert "most parameters of the model cannot be compared" in format_check(blind)
 
 
 def test_single_runs_that_differ_cannot_tell_and_other_runs_of_the_robot_can(
@@ -98,9 +106,9 @@ def test_single_runs_that_differ_cannot_tell_and_other_runs_of_the_robot_can(
 
     assert found.code == UNDETERMINED
     assert [number.name for number in found.list_status("differs")] == [LAG]
-    assert "how much runs of this robot differ without a change is not known" in format_verdict(found)
+    assert "how much runs of this robot differ without a change is not known" in format_check(found)
     assert 0.0 < find(found, LAG).low < 0.15 < find(found, LAG).high
-    assert ("", "intervals: of these recordings alone") in list_lines(found)
+    assert ("", "intervals: of these recordings alone") in list_check_lines(found)
 
     others = {"grass": late.before[1:], "sand": late.after[1:], "tile": same.after}
     told = compare_sides(replace(one, others=others))
@@ -112,7 +120,7 @@ def test_single_runs_that_differ_cannot_tell_and_other_runs_of_the_robot_can(
 def test_two_single_runs_that_are_alike_show_no_change(same: Sides) -> None:
     found = compare_sides(replace(same, before=same.before[:1], after=same.after[:1]))
     assert found.code == KEPT
-    assert "How much runs of this robot differ without a change is not known" in format_verdict(found)
+    assert "How much runs of this robot differ without a change is not known" in format_check(found)
 
 
 def make_readings(rng: np.random.Generator, shift: float = 0.0) -> tuple[RunReading, ...]:
@@ -152,11 +160,11 @@ def test_a_multiplier_is_a_setting_known_to_two_percent_however_many_runs(late: 
             assert find(check, MULTIPLIER).status == status
 
 
-def read_suite(found: Check) -> ET.Element:
+def read_suite(found: RunsCheck) -> ET.Element:
     return ET.fromstring(format_junit(found).encode())  # noqa: S314 - our own
 
 
-def judge(tmp_path: Path, sides: Sides, text: str) -> Check:
+def judge(tmp_path: Path, sides: Sides, text: str) -> RunsCheck:
     path = tmp_path / "check.toml"
     path.write_text(text, encoding="utf-8")
     return compare_sides(sides, read_limits(path))
@@ -181,7 +189,7 @@ def test_a_limit_within_the_interval_cannot_be_told(late: Sides, tmp_path: Path)
     found = judge(tmp_path, late, f'[parameter]\n"drive_lag.tau" = {{max = {value:.6f}}}')
 
     assert found.code == UNDETERMINED
-    assert "0 of 1 limits kept, 1 cannot be judged" in format_verdict(found)
+    assert "0 of 1 limits kept, 1 cannot be judged" in format_check(found)
 
 
 def test_a_limit_of_an_unknown_number_names_those_that_there_are(late: Sides, tmp_path: Path) -> None:
@@ -217,7 +225,7 @@ def test_every_format_says_the_same_and_markup_in_a_name_stays_text(late: Sides)
     error = content["error"]
     assert error["low"] < error["ratio"] < error["high"]
     assert error["after"] / error["before"] == pytest.approx(error["ratio"])
-    assert list_lines(found)[0] == ("verdict", content["verdict"])
+    assert list_check_lines(found)[0] == ("verdict", content["verdict"])
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert failed == [LAG]
     assert suite.get("failures") == "1"

@@ -22,7 +22,7 @@ from pipeline.simulate import make_scenario, simulate_run, write_log
 from pipeline.sources import Vehicle, find_preset
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.align import measure_body_multiplier
-from pipeline.words.check import format_verdict
+from pipeline.words.check import format_check
 
 TRACK = 1.8
 EFFECTS = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": TRACK}}
@@ -59,7 +59,7 @@ def test_a_changed_multiplier_is_told_with_what_the_robot_then_does_of_its_comma
 
     numbers = {one.name: one for one in found.numbers}
     assert [one.name for one in found.list_status("changed")] == [MULTIPLIER]
-    assert re.search(r"controller's multiplier 1(\.0\d)? -> 1\.8\d", format_verdict(found))
+    assert re.search(r"controller's multiplier 1(\.0\d)? -> 1\.8\d", format_check(found))
     assert numbers["effective_track.k"].status == "unchanged"
     turned = numbers[COMMANDED_TURN]
     assert (turned.before, turned.after) == pytest.approx((1.0 / TRACK, 1.875 / TRACK), rel=0.01)
@@ -73,7 +73,7 @@ def test_without_a_body_command_nothing_is_said_of_it(sides: Sides) -> None:
     ]
     found = compare_sides(replace(sides, before=hidden[0], after=hidden[1]))
     assert {one.name: one.status for one in found.numbers}[MULTIPLIER] == "unknown"
-    assert "multiplier" not in format_verdict(found)
+    assert "multiplier" not in format_check(found)
 
 
 @pytest.mark.parametrize("expected", [1.5, None], ids=["obeyed", "another"])

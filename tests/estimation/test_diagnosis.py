@@ -23,7 +23,6 @@ from pipeline.estimation import (
     diagnose_runs,
     load_recording,
 )
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.ladder import judge_whole
@@ -31,7 +30,7 @@ from pipeline.estimation.model_state import Free
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
-from pipeline.results import Errors, read_result, to_json
+from pipeline.results import to_json
 from pipeline.results.reading import read_model as read_proposed
 from pipeline.simulate import (
     VEHICLES,
@@ -233,7 +232,7 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     # What it is said to bring is what the model has with it.
     data = EstimationData([load_recording(recording, vehicle)], vehicle, Input(run.input))
     whole = judge_whole(data, proposal.model + formula.effect("suggested_term"))
-    assert left.with_formula == read_result(errors_as_json(whole.errors), Errors)
+    assert left.with_formula == whole.errors
     before, after = (one.velocity_rms[0] for one in (run.ladder[-1], left.with_formula))
     assert after < 0.7 * before  # type: ignore[operator]
     assert run.noise_floor is not None

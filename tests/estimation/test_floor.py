@@ -10,9 +10,9 @@ from few import few
 from motion_runs import WANDERING, simulate, vehicle_of
 
 from pipeline.estimation import EstimationData, Input
-from pipeline.estimation.errors import Errors
 from pipeline.estimation.ladder import assess_model
 from pipeline.models import Model, find_effect
+from pipeline.results import Errors
 from pipeline.simulate import Disturbance, PoseSensor, Program
 
 HUSKY = vehicle_of("husky_a200")

@@ -16,16 +16,15 @@ from few import few
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import EstimationData, Input, carry_over, diagnose_runs, load_recording
-from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import parameters_as_json
-from pipeline.estimation.ladder import assess_model, ladder_as_json
+from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
 from pipeline.report.sections import format_remaining
-from pipeline.results import RunDiagnosis, Value, read_result
+from pipeline.results import RunDiagnosis, Value, read_result, to_json
 from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.simulate import simulate_case
 from pipeline.web.prepared import prepare_run
@@ -151,10 +150,10 @@ def check_model_verbs(told: Json, file: ModelFile, data: EstimationData) -> Json
         assert number["at_bound"] == entry["at_bound"]
         for end in ("value", "low", "high"):
             assert same(number[end], entry[end]), (effect, name, end)
-    floor = errors_as_json(judged.floor)
-    ladder = ladder_as_json(judged.ladder, judged.floor)
+    floor = to_json(judged.floor)
+    ladder = [to_json(step) for step in judged.ladder.as_result(judged.floor)]
     (carried,) = carry_over(file.model, list(data.runs), data.source)
-    ideal, own = errors_as_json(carried.ideal.pooled), errors_as_json(carried.own.pooled)
+    ideal, own = to_json(carried.ideal.pooled), to_json(carried.own.pooled)
     for key in ERRORS:
         assert same(told["ladder"][0][key], ladder[0][key])
         assert same(told["ladder"][0][key], ideal[key])

@@ -1,62 +1,67 @@
-"""Why an addition is no help: its sign, its interval, its degenerate form, its gain."""
+"""What would be accepted next in a model, and why an addition would not be: by the judge of the search."""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import TYPE_CHECKING
+
 import pytest
+from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation.additions import explain_errors, explain_refusal
-from pipeline.models import find_effect
-from pipeline.models.parameter import Conditions, Largest
+from pipeline.estimation import EstimationData, Input
+from pipeline.estimation.additions import Tries, explain_refusals
+from pipeline.estimation.ladder import judge_whole
+from pipeline.models import Model, find_effect
+from pipeline.simulate import Disturbance, Program
 
-BELOW = {"t_mrmse_m": 0.1, "r_mrmse_rad": 0.05}
-WORSE = {"t_mrmse_m": 0.11, "r_mrmse_rad": 0.06}
-BETTER = {"t_mrmse_m": 0.08, "r_mrmse_rad": 0.05}
-CLEAR = 12.0
-"""Standard errors."""
+if TYPE_CHECKING:
+    from pipeline.models import Effect
 
-
-def test_what_is_clear_is_not_refused() -> None:
-    track = find_effect("effective_track")(k=1.6)
-    assert explain_refusal(track, {"effective_track.k": (1.55, 1.65)}) is None
+HUSKY = vehicle_of("husky_a200")
 
 
-def test_a_gain_within_the_noise_is_refused() -> None:
-    assert explain_errors(BELOW, BETTER, 3.0) == "the reduction is not significant (t = 3.0, required 5)"
+@pytest.fixture(scope="module")
+def data() -> EstimationData:
+    """A drive by hand with a wide track and a lag."""
+    hidden = {"effective_track": 1.4, "drive_lag": 0.3}
+    run = simulate(hidden, duration_s=100.0, program=Program("teleop"), disturbance=Disturbance(0.02, 0.03))
+    return EstimationData([run], HUSKY, Input.COMMAND)
 
 
-def test_an_interval_that_includes_doing_nothing_is_refused() -> None:
-    track = find_effect("effective_track")(k=1.01)
-    why = explain_refusal(track, {"effective_track.k": (0.98, 1.04)})
-    assert why == "the 95 % interval of k, 0.98 to 1.04, includes 1 (no effect)"
-    # One number that is certain is enough.
-    two = find_effect("side_lag")(tau_left=0.3, tau_right=0.01)
-    certain = {"side_lag.tau_left": (0.25, 0.35), "side_lag.tau_right": (-0.01, 0.03)}
-    assert explain_refusal(two, certain) is None
+def explain(data: EstimationData, *effects: Effect) -> dict[str, str]:
+    step = judge_whole(data, Model(HUSKY, effects))
+    return explain_refusals(step, step.effects)
 
 
-def test_an_impossible_sign_is_refused() -> None:
-    resistance = find_effect("turning_resistance")(k=-0.02)
-    why = explain_refusal(resistance, {"turning_resistance.k": (-0.03, -0.01)})
-    assert "is not possible" in str(why)
-
-
-def test_a_degenerate_form_is_called_by_what_it_is() -> None:
-    conditions = Conditions(Largest(1.0, 1.0, 10.0, 1.0, np.linspace(0.0, 60.0, 11)))
-    lag = find_effect("side_lag")(tau_left=0.3, tau_right=0.3)
-    assert explain_refusal(lag, {}, conditions) == "with these values it acts as drive_lag"
+def test_what_is_there_is_accepted_and_what_is_not_is_refused(data: EstimationData) -> None:
+    track, lag = find_effect("effective_track")(k=1.4), find_effect("drive_lag")(tau=0.3)
+    assert explain(data, track, lag) == {}
+    refused = explain(data, track, lag, find_effect("wheel_radius")(k=1.05))
+    assert list(refused) == ["wheel_radius"]
+    assert "required 5" in refused["wheel_radius"]
 
 
 @pytest.mark.parametrize(
-    ("errors", "reason"),
+    ("effect", "values", "reason"),
     [
-        ({"t_mrmse_m": 0.102, "r_mrmse_rad": 0.04}, "position error rises by 2 %"),
-        (WORSE, "position error rises by 10 %, heading error by 20 %"),
-        ({"t_mrmse_m": 0.0995, "r_mrmse_rad": 0.0499}, "no error over 2 s falls by more than 1 %"),
-        (BETTER, None),
+        ("turning_resistance", {"k": -0.02}, "k = -0.02 s is not possible: it must be above 0 s"),
+        ("side_lag", {"tau_left": 0.3, "tau_right": 0.3}, "with these values it acts as drive_lag"),
     ],
-)  # fmt: skip
-def test_errors_that_rise_or_do_not_fall_speak_against_an_addition(
-    errors: dict[str, float], reason: str | None
+)
+def test_values_that_are_held_and_cannot_be_are_told(
+    data: EstimationData, effect: str, values: dict[str, float], reason: str
 ) -> None:
-    assert explain_errors(BELOW, errors, CLEAR) == reason
+    held = find_effect(effect)(**values).fix(*values)
+    track = find_effect("effective_track")(k=1.4)
+    assert explain(data, track, held)[effect].startswith(reason)
+
+
+def test_after_the_last_accepted_effect_nothing_is_next(data: EstimationData) -> None:
+    """Whatever is accepted is added, the largest fall first: what is hidden, and then no more."""
+    model = Model(HUSKY)
+    for _ in range(4):
+        tries = Tries(data, model)
+        accepted = tries.fold([one for one in tries.try_each() if one is not None])
+        if not accepted:
+            break
+        model = judge_whole(data, model + accepted[0].effect).fitted.model
+    assert sorted(model.ids) == ["drive_lag", "effective_track"]

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from verbs import run_verb
 
-from pipeline.estimation.additions import rank_named
-from pipeline.estimation.errors import Errors
 from pipeline.estimation.ladder import lowers_errors, raises_errors
 from pipeline.estimation.largest import _is_one_speed
 from pipeline.estimation.terms import list_terms
-from pipeline.models import Model, find_effect, read_model
+from pipeline.models import Model, read_model
 from pipeline.models.formula import FormulaEffect
+from pipeline.results import Errors
 from pipeline.sources import find_preset
 
 SHARED = Path(__file__).parents[3] / "shared"
@@ -56,23 +55,6 @@ def test_an_effect_raises_or_lowers_the_errors_by_one_rule() -> None:
         before = errors_of((1.0, 1.0))
         assert raises_errors(before, errors_of(after)) is raises
         assert lowers_errors(before, errors_of(after)) is lowers
-
-
-def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_not() -> None:
-    """`lateral_drift` at +12 % was the button, before what lowered the error by two thirds."""
-    assert HUSKY is not None
-    reached = {"lateral_drift": (1.12, 1.01), "effective_track": (0.34, 0.5), "icr_offset": (1.0, 0.9995)}
-    named = [find_effect(name)() for name in reached]
-
-    def judge(model: Model) -> Errors:
-        (name,) = model.ids
-        return errors_of(reached[name])
-
-    ranked = rank_named(judge, Model(HUSKY), errors_of((1.0, 1.0)), named)
-    assert [(one.effect.id, one.helps) for one in ranked] == [
-        ("effective_track", True),
-        ("icr_offset", False),
-    ]
 
 
 def test_commands_of_one_speed_are_told_by_their_spread() -> None:

@@ -14,7 +14,7 @@ from pipeline.cli.verbs_drives import list_written_effects
 from pipeline.estimation import EstimationData, Input, estimate_intervals, fit_model
 from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
-from pipeline.models.catalogue import find_late_effect, format_effect
+from pipeline.models.catalogue import find_late_effect, format_page
 from pipeline.models.effect import Excitation, KinematicEffect, Late
 from pipeline.models.expression import parse_expression
 from pipeline.models.families import check_formula
@@ -281,7 +281,7 @@ def check_page(effect: type[Effect]) -> None:
 
 def check_sizes(effect: type[Effect]) -> None:
     """They have reasons and fit each other."""
-    page = format_effect(effect)
+    page = format_page(effect)
     for reading in effect.readings:
         assert reading.text in page
     assert len({reading.level for reading in effect.readings}) == len(effect.readings)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from few import few
@@ -220,7 +221,7 @@ def test_the_floor_is_nearly_the_same_whatever_the_model_lacks() -> None:
         EstimationData([run], HUSKY, Input.MEASURED), model_of("effective_track", "icr_offset")
     )
     assert np.allclose(judged.floor.ratios(floors[1]), 1.0, atol=0.2)
-    low = replace(judged.floor, t_mrmse_m=1.2 * judged.ladder.steps[-1].errors.t_mrmse_m)
+    low = msgspec.structs.replace(judged.floor, t_mrmse_m=1.2 * judged.ladder.steps[-1].errors.t_mrmse_m)
     share = judged.ladder.explained_shares(low)[-1]
     assert share is not None
     assert share > 1.0

@@ -7,10 +7,11 @@ from learners import Lesson, list_learners
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-from pipeline.estimation import Errors, EstimationData, HeldOut, Input, fit_model, hold_out
+from pipeline.estimation import EstimationData, HeldOut, Input, fit_model, hold_out
 from pipeline.estimation.rivals import Contest, Rival, compare_errors, hold_contest, judge_rival
 from pipeline.models import Model
 from pipeline.models.literature import find_model
+from pipeline.results import Errors
 from pipeline.simulate import simulate_case
 
 HUSKY = vehicle_of("husky_a200")

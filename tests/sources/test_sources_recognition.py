@@ -6,7 +6,7 @@ from simulated_platforms import PLATFORMS
 from pipeline.logs import ChannelInfo
 from pipeline.sources import (
     Recognized,
-    find_alike,
+    find_alike_vehicles,
     find_preset,
     list_contradictions,
     read_description,
@@ -126,10 +126,10 @@ def test_where_description_and_preset_differ_both_are_said() -> None:
 
 
 def test_a_fitted_geometry_is_compared_with_the_platforms() -> None:
-    assert list(find_alike(0.0331, 0.286)) == ["turtlebot3_waffle", "turtlebot3_burger"]
-    assert find_alike(0.5, 0.1) == {}
+    assert list(find_alike_vehicles(0.0331, 0.286)) == ["turtlebot3_waffle", "turtlebot3_burger"]
+    assert find_alike_vehicles(0.5, 0.1) == {}
     # A skid-steered platform turns as if its track were wider; other wheels are no guess.
-    alike = find_alike(0.165, 1.01)
+    alike = find_alike_vehicles(0.165, 1.01)
     assert alike["husky_a200"] == ("Clearpath Husky A200", pytest.approx(0.55 / 1.01))
     assert "warthog_tracks" not in alike
 

@@ -1,0 +1,261 @@
+"""What to drive next: plans, and plans compared with what was driven."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline import plan as planning
+from pipeline.analysis import Options
+from pipeline.api.opening import Opener, Progress, open_quietly, show_nothing
+from pipeline.core import SlipError, align_rows, format_count, format_duration
+from pipeline.estimation import Recording, diagnose_runs, load_recording
+from pipeline.estimation.stored_diagnosis import read_recording
+from pipeline.plan import SAFETY, CheckedPlan, Plan
+from pipeline.report.drive_pages import leave_plan, write_drive
+from pipeline.sources import Vehicle, find_preset, list_presets
+from pipeline.store import Manifest, Store
+
+
+@dataclass(frozen=True)
+class PlannedDrive:
+    """A plan, and where it was written.
+
+    Attributes:
+        plan: the drive, and what it promises.
+        files: the files that were written.
+        driven_s: length of the logs so far [s]; 0 without logs.
+        lossy: whether one of them had losses.
+        report: the report that shows it; None without one.
+        warning: why the report of the run does not show it; empty without a reason.
+    """
+
+    plan: Plan
+    files: tuple[Path, ...]
+    driven_s: float
+    lossy: bool = False
+    report: Path | None = None
+    warning: str = ""
+
+    def to_json(self) -> dict[str, object]:
+        """The object of `slip plan --json`."""
+        return {**self.plan.to_json(), "files": [str(file) for file in self.files]}
+
+    def describe(self, said: str = "") -> list[str]:
+        """The plan on one screen, what it will decide first.
+
+        Args:
+            said: flags that the next command needs again.
+        """
+        lines = self._describe(said)
+        return lines if self.report is None else [*lines, f"report       {self.report} shows it"]
+
+    def _describe(self, said: str) -> list[str]:
+        made, files, driven_s = self.plan, self.files, self.driven_s
+        runs = (
+            f"after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
+        )
+        if not made.questions:
+            return [f"no open question {runs}: no cause is undecided, and each number is known well enough"]
+        ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
+        rows = align_rows([(f"open {runs}".strip(), "so far", "with this drive"), *made.list_rows()])
+        most = f"limits       {made.limits.format(steered=made.steered)}"
+        if not made.manoeuvres:
+            nothing = f"no drive on {ground} of level ground answers an open question: no file is written"
+            return [nothing, *(f"  {row}" for row in rows), most]
+        names = [
+            f"{number} x {name}" for name, number in Counter(name for name, _ in made.manoeuvres).items()
+        ]
+        return [
+            made.summarize(),
+            *(f"  {row}" for row in rows),
+            f"drive        {made.commands.duration_s:.0f} s on {ground}: {', '.join(names)}",
+            (
+                "place        start in the middle, heading along the length; "
+                f"end within {made.home_m:.1f} m of it"
+            ),
+            most,
+            f"play         ros2 bag play {files[2]}    # {made.type_name} on {made.topic}",
+            f"page         {files[-1]}",
+            *(f"safety       {text}" for text in SAFETY),
+            f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",
+        ]
+
+
+def plan_drive(
+    names: Sequence[str],
+    options: Options,
+    folder: Path,
+    *,
+    vehicle: str | None = None,
+    time: str = "60s",
+    area: str = "20x10m",
+    max_speed: float | None = None,
+    max_yaw_rate: float | None = None,
+    max_acceleration: float | None = None,
+    topic: str | None = None,
+    type_name: str | None = None,
+    opened: Opener = open_quietly,
+    progress: Progress = show_nothing,
+) -> PlannedDrive:
+    """Plan the drive that tells most of what logs left open, as `slip plan` does, and write it.
+
+    Args:
+        names: logs or runs of one vehicle; without one the plan covers all effects of the vehicle.
+        options: how logs are analyzed, and the folder of results.
+        folder: folder of the plan.
+        vehicle: vehicle preset, where there are no logs.
+        time: longest duration, for example 60s or 2min.
+        area: free area: length along the initial heading, and width.
+        max_speed: highest speed [m/s]; None for what the runs commanded, as for the yaw rate.
+        max_yaw_rate: highest yaw rate [rad/s].
+        max_acceleration: highest acceleration [m/s^2].
+        topic: topic of the commands; None for the recorded one.
+        type_name: message type of that topic.
+        opened: how logs and runs are opened.
+        progress: how the stages of the plan are shown.
+
+    Raises:
+        SlipError: a text cannot be read, there is no vehicle, or nothing can be planned from the runs.
+    """
+    seconds = planning.parse_time(time)
+    gathered = _gather(names, options, opened) if names else None
+    chosen = find_preset(vehicle or "") if gathered is None else gathered.vehicle
+    if chosen is None:
+        known = ", ".join(preset.id for preset in list_presets())
+        what = f"no preset is called {vehicle!r}" if vehicle else "a plan needs a run or a vehicle"
+        raise SlipError("no_vehicle", what, hint=f"Give a log, a run, or --vehicle as one of {known}.")
+    # Report wrong options before a long diagnosis.
+    ground = planning.parse_area(area, chosen)
+    with progress(names[0] if names else vehicle or "plan") as notify:
+        notify("diagnosis")
+        studied, first = planning.Studied(chosen), None
+        if gathered is not None:
+            studied = planning.study(gathered.recordings, chosen, notify)
+            first = gathered.manifests[0]
+        limits = planning.choose_limits(
+            chosen,
+            studied.largest,
+            speed_mps=max_speed,
+            yaw_rate_radps=max_yaw_rate,
+            acceleration_mps2=max_acceleration,
+        )
+        usual = planning.choose_topic(chosen, first)
+        played = (topic or usual[0], type_name or usual[1])
+        made = planning.make_plan(studied, limits, ground, seconds, played, notify)
+    files = write_drive(made, folder, options.out)
+    if gathered is None or len(gathered.manifests) != 1:
+        return PlannedDrive(made, files, studied.driven_s, gathered is not None and gathered.lossy)
+    # The plan of one stored run is shown with it.
+    report, warning = None, ""
+    try:
+        report = leave_plan(Store(options.out), gathered.manifests[0], made)
+    except (SlipError, OSError) as error:
+        warning = f"the report of the run does not show the plan: {error}"
+    return PlannedDrive(made, files, studied.driven_s, gathered.lossy, report, warning)
+
+
+@dataclass(frozen=True)
+class DrivenPlan:
+    """A plan beside what was driven.
+
+    Attributes:
+        checked: which promises were kept.
+        earlier: the runs that the plan was made of.
+        is_open: whether something is still undecided.
+        lossy: whether a log had losses.
+    """
+
+    checked: CheckedPlan
+    earlier: Sequence[str]
+    is_open: bool
+    lossy: bool
+
+    def describe(self) -> list[str]:
+        """What was promised, and what was measured."""
+        rows = [
+            f"{'kept' if one['kept'] else 'NOT KEPT':<9} {one['question']}: "
+            f"promised {one['promised']}, {one['measured']}"
+            for one in self.checked.outcomes
+        ]
+        rows += [f"open      {text}" for text in self.checked.open]
+        return rows or ["the plan promised nothing"]
+
+
+def check_drive(
+    path: Path,
+    names: Sequence[str],
+    options: Options,
+    *,
+    opened: Opener = open_quietly,
+    progress: Progress = show_nothing,
+) -> DrivenPlan:
+    """Compare a plan's promises with the joint diagnosis of the earlier runs and the drive.
+
+    Args:
+        path: the plan, or its folder.
+        names: logs or runs that were driven by it.
+        options: how logs are analyzed, and the folder of results.
+        opened: how logs and runs are opened.
+        progress: how the stages of the diagnosis are shown.
+
+    Raises:
+        SlipError: there is no log, it is of another vehicle, or it does not play the plan.
+    """
+    stored = planning.read_plan(path)
+    if not names:
+        what = "a check needs the log that was driven"
+        raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
+    drive = _gather(names, options, opened)
+    new = len(drive.recordings)
+    before = [name for name in stored.runs if name not in {*names, *(one.name for one in drive.recordings)}]
+    if stored.vehicle != drive.vehicle.id:
+        what = f"the plan is for {stored.vehicle}, and the log is of {drive.vehicle.id}"
+        hint = "Check a plan with logs of the vehicle it was made for."
+        raise SlipError("other_vehicle", what, where=str(path), hint=hint)
+    vehicle, recordings, _, lossy = _gather(before, options, opened, drive)
+    with progress(names[0]) as notify:
+        notify("diagnosis")
+        driven = [load_recording(recording, vehicle) for recording in drive.recordings]
+        planning.require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
+        diagnosis = diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
+    return DrivenPlan(planning.check_plan(stored, diagnosis), before, bool(diagnosis.undecided), lossy)
+
+
+class _Gathered(NamedTuple):
+    """Runs of one vehicle, and whether one had losses."""
+
+    vehicle: Vehicle
+    recordings: list[Recording]
+    manifests: list[Manifest]
+    lossy: bool
+
+
+def _gather(
+    names: Sequence[str], options: Options, opened: Opener, known: _Gathered | None = None
+) -> _Gathered:
+    """Runs of one vehicle, each once, after those that are known already."""
+    recordings = [] if known is None else [*known.recordings]
+    manifests = [] if known is None else [*known.manifests]
+    vehicles = [] if known is None else [known.vehicle] * len(recordings)
+    lossy = known is not None and known.lossy
+    for name in names:
+        with opened(name, options) as one:
+            vehicle, recording = read_recording(one.manifest)
+        lossy |= one.lossy
+        if recording.sha256 and any(recording.sha256 == known.sha256 for known in recordings):
+            continue
+        vehicles.append(vehicle)
+        recordings.append(recording)
+        manifests.append(one.manifest)
+    if other := next((vehicle for vehicle in vehicles if vehicle != vehicles[0]), None):
+        fields = other.__struct_fields__
+        differing = [name for name in fields if getattr(other, name) != getattr(vehicles[0], name)]
+        what = f"the runs are of different vehicles (in {', '.join(differing)}), and a plan is for one"
+        where = ", ".join(recording.name for recording in recordings)
+        raise SlipError("several_vehicles", what, where=where, hint="Give runs of one vehicle.")
+    return _Gathered(vehicles[0], recordings, manifests, lossy)
