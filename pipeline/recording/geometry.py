@@ -15,7 +15,7 @@ from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.evidence import RIMS
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Fit, Motion, Steps
 from pipeline.recording.readings import SIDES, Explained, Reading
-from pipeline.sources import RANGES, DriveForm
+from pipeline.sources import RANGES, DriveForm, find_alike_vehicles
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _SAME_TRACK = 0.1
