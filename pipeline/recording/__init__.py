@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from pipeline.core import INPUTS, SlipError
 
 if TYPE_CHECKING:
-    from pipeline.recording.examination import Recording, examine, examine_drive
+    from pipeline.recording.examination import Recording, examine
 
 __all__ = [
     "FAULTS",
@@ -21,7 +21,6 @@ __all__ = [
     "Recording",
     "RecordingError",
     "examine",
-    "examine_drive",
 ]
 
 

@@ -355,15 +355,13 @@ def _lacks_pose(
 
 
 def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configuration) -> Choice:
-    """The choice for a log without poses, see `examine_drive`; unchanged if its wheels cannot be read."""
-    from pipeline.recording import examine_drive  # noqa: PLC0415 - heavy
+    """The choice for a log without poses; unchanged if its wheels cannot stand in for one."""
+    from pipeline.recording import examine  # noqa: PLC0415 - heavy
 
     drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, drives))
-    recording = examine_drive(
-        Given(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
-    )
-    if recording is None:
+    recording = examine(Given(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path)))
+    if recording.sources.pose is None:
         return chosen
     return replace(
         chosen,

@@ -4,11 +4,13 @@ Whether the base lost them, too, its motion tells: it obeyed what is between the
 last one that is recorded.
 """
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 
 from pipeline.core import NORMAL_95, Floats, format_share
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import Case
 from pipeline.recording.motion import compare
 from pipeline.recording.readings import Reading
 from pipeline.stages import Finding, number_gaps
@@ -24,39 +26,34 @@ _FEWEST_GAPS = 10
 deviations below."""
 
 
-def resolve_losses(case: Case, command: Candidate | None) -> None:
+def ask_losses(case: Case) -> Case:
     """Tell which share of the commands is lost, and take those between the others that the base obeyed.
 
     Beforehand it is as likely that the base lost them as that it did not: the motion decides at 95 %.
-
-    Args:
-        case: the log.
-        command: the candidate for the command, whose reading is replaced.
     """
-    if command is None or len({signal.topic for signal in command.source.signals}) > 1:
-        return
+    command = case.command
+    if len({signal.topic for signal in command.source.signals}) > 1:
+        return case
     reading, section = command.reading, case.complete().command
     share, period = find_losses(reading)
     made = reading.explained
-    if not share or made is None:
-        return
+    if not share or not made.is_known:
+        return case
     text = (
         f"{format_share(share)} of the messages of {command.source} are missing: they come every "
         f"{period:.2g} s, or after two, three or more times that, at random. They were lost, as over a "
         "radio link or with QoS best effort"
     )
-    filled = None
+    filled = Reading()
     if not section.interpolate and section.hold_s is None:
         between = msgspec.structs.replace(section, interpolate=True)
-        filled = case.read(command.source, is_measured=False, section=between)
-    tried = None if filled is None else filled.explain(made.motion)
+        filled = case.read(command.source, is_measured=False, section=between).fitted(made.motion)
     gain = 0.0
-    if tried is not None and tried.blocks.size == made.blocks.size:
-        gain = compare(tried.blocks, made.blocks)
-    if filled is not None and gain > NORMAL_95:
+    if filled.explained.blocks.size == made.blocks.size:
+        gain = compare(filled.explained.blocks, made.blocks)
+    if gain > NORMAL_95:
         case.changes.setdefault("command", {})["interpolate"] = True
-        command.reading = filled
-        filled.explain(made.motion)
+        command = replace(command, reading=filled)
         text += (
             ", but the base got them: those missing are taken to be between the ones around them, as "
             "interpolate = true under [command] in run.toml does"
@@ -69,6 +66,7 @@ def resolve_losses(case: Case, command: Candidate | None) -> None:
             f"drive is up to {1e3 * period * share / (1.0 - share):.0f} ms longer than found"
         )
     case.findings.append(Finding("commands_lost", "warning", text, where="command", value=share))
+    return replace(case, command=command)
 
 
 def find_losses(reading: Reading) -> tuple[float, float]:

@@ -3,12 +3,13 @@
 Which of them a drive obeys depends on when it reads, so that nothing is concluded from what they ask for.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from pipeline.core import Floats, format_share
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import NO_CANDIDATE, Case
 from pipeline.recording.outages import write_spans
 from pipeline.recording.readings import Reading
 from pipeline.run import LIVE_SHARE
@@ -33,15 +34,16 @@ _MOST = 0.5
 """Share of the driving from which on the turns are no exception, and the command is of no use."""
 
 
-def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate | None) -> Candidate | None:
-    """Leave out where two publishers command by turns; the command, or nothing if that is nearly all."""
-    if command is None or case.complete().command.ignore is not None:
-        return command
+def ask_publishers(case: Case) -> Case:
+    """Leave out where two publishers command by turns, or the command if that is nearly all."""
+    command, wheels = case.command, case.wheels
+    if case.complete().command.ignore is not None:
+        return case
     reading = command.reading
     times, asked = _read_commands(reading)
     spans = find_turns(times, asked)
     if not spans:
-        return command
+        return case
     live = np.linalg.norm(asked, axis=1) > 0.0
     inside = np.logical_or.reduce([(times >= start) & (times <= end) for start, end in spans])
     zeros = float(np.mean(~live[inside]))
@@ -57,7 +59,7 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
         "time (twist_mux does)"
     )
     is_rest_used = bool(np.mean(inside[live]) < _MOST)
-    is_replaced = not is_rest_used and wheels is not None and wheels.is_sure
+    is_replaced = not is_rest_used and wheels.is_sure
     if is_rest_used:
         ignore = [
             OutageSection(start_s=float(np.floor(1e2 * start) / 1e2), end_s=float(np.ceil(1e2 * end) / 1e2))
@@ -73,14 +75,11 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
     severity: Literal["warning", "error"] = "warning" if is_usable else "error"
     case.findings.append(Finding(name, severity, text, where="command", value=zeros, count=len(spans)))
     if is_replaced:
-        case.leave_out(command.source)
-        return None
-    if is_rest_used:
-        read = case.read(command.source, is_measured=False, section=case.complete().command)
-        if read is not None and reading.explained is not None:
-            read.explain(reading.explained.motion)
-            command.reading = read
-    return command
+        return replace(case.leave_out(command.source), command=NO_CANDIDATE)
+    read = case.read(command.source, is_measured=False, section=case.complete().command)
+    if not (is_rest_used and read.form and reading.explained.is_known):
+        return case
+    return replace(case, command=replace(command, reading=read.fitted(reading.explained.motion)))
 
 
 def _read_commands(reading: Reading) -> tuple[Floats, Floats]:
