@@ -33,12 +33,11 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.logs import read_topics
 from pipeline.models import find_effect
 from pipeline.recording.log_setup import set_up_log
 from pipeline.results import Named, Value
 from pipeline.sources import DriveSection, DriveSource, Sources, Vehicle
-from pipeline.stages import Extraction, Given, extract_tables, list_wanted
+from pipeline.stages import Extraction, Given, extract_tables
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
@@ -118,9 +117,9 @@ class Answer:
 def _extract(log: Path) -> tuple[Sources, Vehicle, Mapping[str, pl.DataFrame]]:
     """Sources, vehicle and tables of a recording as it is."""
     setup = set_up_log(log, Options(out=Path()))
-    data = setup.choice.data if setup.choice.extracted is None else None
-    data = data or read_topics(setup.index, list_wanted(setup.sources, setup.index.types))
-    made = extract_tables(Given(data, setup.sources, setup.configuration, setup.vehicle, str(log)))
+    made = extract_tables(
+        Given(setup.choice.take_log(), setup.sources, setup.configuration, setup.vehicle, str(log))
+    )
     return setup.sources, setup.vehicle, made.tables
 
 

@@ -37,7 +37,7 @@ from pipeline.sources import (
     PoseSource,
     Sources,
 )
-from pipeline.stages import Cut, Finding, Given
+from pipeline.stages import Finding, Given
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,6 @@ class Recording:
         geometry: lengths by the signals.
         evidence: on every signal that was tried.
         alignment: corrections of the command; None where nothing shows them.
-        cut: the poses, cut into segments; None where they were not read.
         is_still: whether the body hardly moves where the drive does.
     """
 
@@ -86,7 +85,6 @@ class Recording:
     geometry: Geometry = field(default_factory=Geometry)
     evidence: tuple[Evidence, ...] = ()
     alignment: Alignment | None = None
-    cut: Cut | None = None
     is_still: bool = False
 
     @property
@@ -207,7 +205,6 @@ def _conclude(case: Case) -> Recording:
         case.geometry,
         tuple(evidence),
         case.alignment,
-        case.extraction.cut,
         case.is_still,
     )
 

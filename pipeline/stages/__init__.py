@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from pipeline.stages.extract import Extracted, Extraction, Given, extract_tables
     from pipeline.stages.findings import Finding, Severity, StageError, blame_damage, tabulate_findings
     from pipeline.stages.inputs import WINDOW_S
+    from pipeline.stages.log_columns import LogColumns
     from pipeline.stages.lost_messages import number_gaps
     from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose
-    from pipeline.stages.pose_topics import POSE_FINDINGS, SLOW_HZ, Cut
+    from pipeline.stages.pose_topics import POSE_FINDINGS, SLOW_HZ
     from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
     from pipeline.stages.slip_stage import (
         PUBLISHED_SAMPLES,

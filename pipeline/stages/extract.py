@@ -11,7 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, format_share
-from pipeline.logs import LogData, TopicColumns, join_channels
+from pipeline.logs import TopicColumns
 from pipeline.sources import (
     DEFAULT_INTERVAL,
     UNKNOWN_VEHICLE,
@@ -43,9 +43,10 @@ from pipeline.stages.drive import (
     read_speed,
 )
 from pipeline.stages.findings import Finding, StageError, blame_damage
+from pipeline.stages.log_columns import LogColumns
 from pipeline.stages.lost_messages import fill_gaps
-from pipeline.stages.pose_topics import Cut, read_bodies
-from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
+from pipeline.stages.pose_topics import read_bodies
+from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.stages.tilt import lean
 from pipeline.stages.trust import check_echo
 
@@ -70,20 +71,18 @@ class Given:
     """A log with what is known of it: what its examination and its extraction start from.
 
     Attributes:
-        data: columns of the wanted topics (see `reading.list_wanted`).
+        log: columns of the wanted topics (see `reading.list_wanted`).
         sources: topic of each role; before an examination, candidates by type and name, the likeliest first.
         configuration: units, signs, clocks, intervals.
         vehicle: the log's, or `UNKNOWN_VEHICLE` of its kind.
         where: the log, for error messages.
-        cut: its poses, where they were cut before.
     """
 
-    data: LogData
+    log: LogColumns
     sources: Sources
     configuration: Configuration
     vehicle: Vehicle
     where: str
-    cut: Cut | None = None
 
     @property
     def is_known(self) -> bool:
@@ -94,7 +93,7 @@ class Given:
         """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
         drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
         return self.vehicle.kinematics.has_inputs("sideways") or any(
-            reading.find_sideways_share(self.data.topics, one) for one in drives
+            reading.find_sideways_share(self.log.data.topics, one) for one in drives
         )
 
 
@@ -128,20 +127,6 @@ def extract_tables(given: Given) -> Extracted:
     return Extraction(given).run()
 
 
-def _make_alike(channels: Sequence[TopicColumns]) -> list[TopicColumns]:
-    """Channels of several types with the fields that all have, and with stamps if all have them."""
-    shared = set.intersection(*(set(columns.fields) for columns in channels))
-    stamped = all(columns.header_time is not None for columns in channels)
-    return [
-        replace(
-            columns,
-            header_time=columns.header_time if stamped else None,
-            fields={name: column for name, column in columns.fields.items() if name in shared},
-        )
-        for columns in channels
-    ]
-
-
 class Extraction:
     """One log's extraction: columns, common clocks, and findings.
 
@@ -149,26 +134,28 @@ class Extraction:
     """
 
     def __init__(self, given: Given) -> None:
-        topics, self.findings = remove_absurd(given.data.topics)
-        self.data = data = replace(given.data, topics=topics)
+        self.log, self.data = given.log, given.log.data
+        self.findings = list(given.log.findings)
+        topics = self.data.topics
         self.sources = sources = given.sources
         self.configuration = configuration = given.configuration
-        self.vehicle, self.where, self.cut = given.vehicle, given.where, given.cut
+        self.vehicle, self.where = given.vehicle, given.where
         self.frames = ("", "")
         self._orders: dict[str, Ints] = {}
         # What is recorded beside the command explains it: it takes no part in clocks and in the time base.
         beside = sources.body_beside
         aside = None if beside is None else beside.signals[0].topic
-        recorded: dict[str, list[TopicColumns]] = {}
-        for columns in topics:
-            if columns.topic != aside:
-                recorded.setdefault(columns.topic, []).append(columns)
-        joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
-        self.columns = {columns.topic: columns for columns in joined if columns is not None}
+        self.columns: dict[str, TopicColumns] = {}
+        for topic in dict.fromkeys(columns.topic for columns in topics if columns.topic != aside):
+            joined, findings = self.log.join(topic)
+            self.findings += findings
+            if joined is not None:
+                self.columns[topic] = joined
         if configuration.imu.unit == "deg/s":
             self.take_degrees()
-        used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
-        self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
+        unfit = self.data.unfit
+        used = {one.topic for one in reading.list_wanted(sources, self.data.index.types)} if unfit else ()
+        self.findings += [self._report_left_out(one) for one in unfit if one.topic in used]
         pose = sources.pose
         drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
         self.chain = (
@@ -196,43 +183,10 @@ class Extraction:
         }
         return Extracted(tables, tuple(self.findings), self.start_ns, self.paused_s, clocks, self.frames)
 
-    def _join_channels(self, topic: str, recorded: Sequence[TopicColumns]) -> TopicColumns | None:
-        """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
-        # All texts of a topic may be unreadable.
-        stamped = [reading.with_stamps(columns) for columns in recorded if columns.log_time.size]
-        channels = [columns for columns in stamped if columns.log_time.size]
-        if len(channels) <= 1:
-            return channels[0] if channels else None
-        types = self._list_types(channels)
-        if len(types) > 1:
-            channels = _make_alike(channels)
-        joined = join_channels(channels)
-        count = len(channels)
-        if joined is not None and len(types) > 1:
-            text = f"{topic} carries {len(types)} types, all read: {', '.join(types)}"
-            if len(types) == 2:  # noqa: PLR2004 - as one says it
-                text = f"{topic} carries two types, both read: {' and '.join(types)}"
-            if joined.header_time is None and any(one.header_time is not None for one in stamped):
-                text += "; one of them has no stamps: the times of recording are used"
-            self.findings.append(Finding("several_types", "warning", text, where=topic, count=len(types)))
-            return joined
-        if joined is not None:
-            text = f"{topic} was recorded on {count} channels: their messages were put in one order"
-            self.findings.append(Finding("several_channels", "info", text, where=topic, count=count))
-            return joined
-        text = f"{topic} was recorded on {count} channels of different types: the fullest was used"
-        self.findings.append(Finding("several_channels", "warning", text, where=topic, count=count))
-        return max(channels, key=lambda columns: columns.log_time.size)
-
-    def _list_types(self, channels: Sequence[TopicColumns]) -> list[str]:
-        """Types of channels as recorded, each once."""
-        ids = {columns.channel_id for columns in channels}
-        return list(dict.fromkeys(one.type_name for one in self.data.index.channels if one.id in ids))
-
     def _report_left_out(self, columns: TopicColumns) -> Finding:
         """Messages of a topic that lack the fields that its other type has."""
         topic, count = columns.topic, columns.log_time.size
-        others = ", ".join(self._list_types([one for one in self.data.topics if one.topic == topic]))
+        others = ", ".join(self.log.list_types(self.data.of(topic)))
         text = f"{topic} carries two types: {count} messages of {columns.type_name}"
         if count:
             first, last = ((int(time) - self.data.index.start_ns) / 1e9 for time in columns.log_time[[0, -1]])
@@ -252,7 +206,7 @@ class Extraction:
         if self.chain is not None and self.sources.pose is not None:
             topic, times = self.sources.pose.topic, self.chain
             recorded[topic] = Recorded(topic, times.log_time, times.log_time, times.time, asked.get(topic))
-        clocks, findings = align_clocks(recorded)
+        clocks, findings = self.log.once(align_clocks, recorded)
         self.findings += findings
         pauses = find_pauses(times.log_time for times in recorded.values())
         self.paused_s = sum(after - last for last, after in pauses) / 1e9
@@ -354,10 +308,10 @@ class Extraction:
             )
             self.findings.append(Finding("body_upside_down", "warning", text, where=source.topic))
         position, quaternion = self._lean(source, times, position, quaternion)
-        recorded = (times, position, quaternion, breaks, self.configuration.velocity, source.topic)
-        if self.cut is None or not self.cut.is_of(recorded):
-            self.cut = Cut(recorded, pose_topics.cut_track(*recorded))
-        track = self.cut.track
+        limits = self.configuration.velocity
+        track = self.log.once(
+            pose_topics.cut_track, times, position, quaternion, breaks, limits, source.topic
+        )
         self.findings += track.findings
         if source.wheels is not None:
             # Wheels at rest repeat their pose, and each reading is new all the same.
@@ -382,7 +336,7 @@ class Extraction:
         if imu is None:
             return position, quaternion
         turn = pose_topics.find_turn(self.data.topics, reading.frame_of(imu.columns))
-        leaning = lean(times, position, quaternion, imu, turn)
+        leaning = self.log.once(lean, times, position, quaternion, imu, turn)
         if leaning is None:
             return position, quaternion
         position, quaternion, steepest, angle = leaning
@@ -588,7 +542,8 @@ class Extraction:
         if beside is None or table.is_empty():
             return table
         topic = beside.signals[0].topic
-        columns = self._join_channels(topic, self.data.of(topic))
+        columns, findings = self.log.join(topic)
+        self.findings += findings
         if columns is None:
             return table
         order = np.argsort(columns.log_time, kind="stable")

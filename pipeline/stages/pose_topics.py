@@ -134,28 +134,6 @@ class Track:
     findings: tuple[Finding, ...] = field(default=())
 
 
-@dataclass(frozen=True)
-class Cut:
-    """Poses that were cut, which are cut once where the examination and the run read them alike.
-
-    Attributes:
-        recorded: arguments of `cut_track`.
-        track: what it made of them.
-    """
-
-    recorded: tuple[Floats | Flags | VelocitySection | str, ...]
-    track: Track
-
-    def is_of(self, recorded: Sequence[Floats | Flags | VelocitySection | str]) -> bool:
-        """Whether these were cut."""
-        return all(
-            np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-            if isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
-            else one == other
-            for one, other in zip(recorded, self.recorded, strict=True)
-        )
-
-
 POSE_FINDINGS: Final = frozenset({"bad_quaternion", "bad_pose", "poses_apart"})
 """Ids of the findings that count the poses that go to quarantine."""
 

@@ -26,6 +26,7 @@ from pipeline.sources import (
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints, unwrap_counter
 from pipeline.stages.extract import Given, extract_tables
+from pipeline.stages.log_columns import LogColumns
 from pipeline.stages.reading import (
     PoseArrays,
     find_angle_unit,
@@ -261,7 +262,9 @@ def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
     chosen = choose(index, Configuration(), {})
     types = {channel.topic: channel.type_name for channel in index.channels}
     data = read_topics(index, list_wanted(chosen.sources, types))
-    made = extract_tables(Given(data, chosen.sources, Configuration(), chosen.vehicle, "run.mcap"))
+    made = extract_tables(
+        Given(LogColumns(data), chosen.sources, Configuration(), chosen.vehicle, "run.mcap")
+    )
     (finding,) = [found for found in made.findings if found.id == "sideways_command"]
     assert finding.severity == "error"
     assert "Husky A200 (differential) cannot do" in finding.text
