@@ -34,10 +34,10 @@ from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import find_effect
+from pipeline.recording import Extraction, Given, extract_tables
 from pipeline.recording.log_setup import set_up_log
 from pipeline.results import Named, Value
 from pipeline.sources import DriveSection, DriveSource, Sources, Vehicle
-from pipeline.stages import Extraction, Given, extract_tables
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96

@@ -13,20 +13,11 @@ from pipeline.analysis import STAGES, Options
 from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, Loss
+from pipeline.recording import POSE_FINDINGS, Finding, Given, extract_tables, tabulate_findings
 from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
-from pipeline.stages import (
-    POSE_FINDINGS,
-    Finding,
-    Given,
-    align_tables,
-    checks,
-    extract_tables,
-    slip_stage,
-    tabulate_findings,
-    velocity,
-)
+from pipeline.stages import align_tables, checks, slip_stage, velocity
 from pipeline.store import (
     JSON,
     CheckedTable,

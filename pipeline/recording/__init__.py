@@ -11,17 +11,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core import INPUTS, SlipError
+from pipeline.door import open_door
 
 if TYPE_CHECKING:
+    from pipeline.recording.clocks import describe_pauses, find_pauses
+    from pipeline.recording.drive import SIGNALS, interpolate_readings
+    from pipeline.recording.echo import check_echo
     from pipeline.recording.examination import Recording, examine
-
-__all__ = [
-    "FAULTS",
-    "LogOptions",
-    "Recording",
-    "RecordingError",
-    "examine",
-]
+    from pipeline.recording.extract import Extracted, Extraction, Given, extract_tables
+    from pipeline.recording.findings import (
+        SURE,
+        Finding,
+        Severity,
+        StageError,
+        blame_damage,
+        tabulate_findings,
+    )
+    from pipeline.recording.hypotheses import BLOCK_S, LASTS_NATS, follow_likeliest, price_change
+    from pipeline.recording.log_columns import LogColumns
+    from pipeline.recording.lost_messages import number_gaps
+    from pipeline.recording.pose_choice import ONE_SCALE, PoseRating, find_steady_gain, measure_rest
+    from pipeline.recording.pose_topics import POSE_FINDINGS, SLOW_HZ
+    from pipeline.recording.topic_values import list_wanted
+else:
+    __getattr__ = open_door(__name__, __file__)
 
 
 class RecordingError(SlipError):
@@ -59,12 +72,3 @@ FAULTS = (
     "pose_flipped",
 )
 """Findings each of which makes every fit meaningless."""
-
-
-def __getattr__(name: str) -> object:
-    # The verdict on a stored run needs the names of faults only.
-    if name not in __all__:
-        raise AttributeError(name)
-    from pipeline.recording import examination  # noqa: PLC0415
-
-    return getattr(examination, name)

@@ -11,6 +11,8 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError
 from pipeline.recording.evidence import RATES, RIMS, SPEEDS, WHEELS, Axis, Units
+from pipeline.recording.extract import Extraction, Given
+from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import Geometry, roll_wheels
 from pipeline.recording.motion import CLEAR, NO_MOTION, Motion
 from pipeline.recording.readings import NO_SIGNAL, UNEXPLAINED, Bent, Explained, Held, Reading
@@ -24,7 +26,6 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.stages import Extraction, Finding, Given
 
 TAKEN_M = 0.1
 """Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""

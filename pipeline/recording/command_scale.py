@@ -12,12 +12,13 @@ import polars as pl
 
 from pipeline.core import Flags, Floats, SlipError, fit_robustly, robust_spread
 from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import FEWEST_STEPS
+from pipeline.recording.pose_choice import ONE_SCALE
 from pipeline.recording.readings import Held, Reading
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import DriveForm, Vehicle, list_presets
-from pipeline.stages import ONE_SCALE, Finding
 
 _LEAST_RATIO = 0.02
 """Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""

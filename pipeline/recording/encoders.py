@@ -7,10 +7,11 @@ import numpy as np
 
 from pipeline.core import Floats, enumerate_texts
 from pipeline.recording.case import Case, is_crossed
+from pipeline.recording.drive import choose_sides
+from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, fit, measure_share
 from pipeline.recording.readings import SIDES, Held
 from pipeline.sources import DriveForm, DriveSection
-from pipeline.stages import Finding, choose_sides
 
 _FOLLOWS = 0.5
 """Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""

@@ -8,6 +8,8 @@ from pipeline.recording.case import Candidate, Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_as_wheels
 from pipeline.recording.evidence import equal_motion
+from pipeline.recording.extract import Given
+from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import Geometry, explain_wheels, roll_wheels
 from pipeline.recording.lengths import ask_lengths
 from pipeline.recording.losses import ask_losses
@@ -37,7 +39,6 @@ from pipeline.sources import (
     PoseSource,
     Sources,
 )
-from pipeline.stages import Finding, Given
 
 
 @dataclass(frozen=True)

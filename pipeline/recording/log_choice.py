@@ -32,7 +32,11 @@ from pipeline.logs import (
     read_topics,
     wanted_transforms,
 )
+from pipeline.recording.extract import Given
+from pipeline.recording.findings import Finding
 from pipeline.recording.folder import find_in_folder
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.topic_values import find_sideways_share, list_wanted, with_texts
 from pipeline.sources import (
     CONFIGURED,
     UNKNOWN_VEHICLE,
@@ -63,13 +67,12 @@ from pipeline.sources import (
     recognize_vehicle,
     resolve_vehicle,
 )
-from pipeline.stages import Finding, Given, LogColumns, find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
     from pipeline.recording import Recording
     from pipeline.recording.geometry import Geometry
-    from pipeline.stages import PoseRating
+    from pipeline.recording.pose_choice import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
 _LISTS = ("new_parameters", "changed_parameters")
@@ -532,7 +535,7 @@ def _list_contradictions(
 def _compare(chosen: Choice, given: Given) -> Choice:
     """Choose among the poses by their content, then the other roles by the motion of the pose."""
     from pipeline.recording import examine  # noqa: PLC0415 - heavy
-    from pipeline.stages import rate_poses, replace_pose  # noqa: PLC0415 - heavy
+    from pipeline.recording.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
     sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
     if sources.others.get("pose") or _may_be_odometry(sources.pose):

@@ -11,9 +11,10 @@ import numpy as np
 
 from pipeline.core import NORMAL_95, Floats, format_share
 from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
+from pipeline.recording.lost_messages import number_gaps
 from pipeline.recording.motion import compare
 from pipeline.recording.readings import Reading
-from pipeline.stages import Finding, number_gaps
 
 _LEAST = 0.05
 """Least share of the messages that is worth a word: by one in twenty a command at 10 Hz is 5 ms old."""

@@ -14,11 +14,12 @@ import polars as pl
 
 from pipeline.core import Flags, Floats, Ints, enumerate_texts, find_scale, fit_robustly, list_likelihoods
 from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
+from pipeline.recording.hypotheses import BLOCK_S, follow_likeliest, price_change
 from pipeline.recording.motion import NO_MOTION, STEP_S, Motion, Steps
 from pipeline.recording.readings import NO_SIGNAL, SIDES, UNEXPLAINED, Held, Reading
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import OutageSection
-from pipeline.stages import BLOCK_S, Finding, follow_likeliest, price_change
 
 _LEAST = 0.03
 """Fraction of the usual largest speed of a side below which a difference is no contradiction."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from pipeline.core import Floats, format_share
 from pipeline.recording.case import NO_CANDIDATE, Case
+from pipeline.recording.findings import Finding
 from pipeline.recording.outages import write_spans
 from pipeline.recording.readings import Reading
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import OutageSection
-from pipeline.stages import Finding
 
 _RETURNS = 0.1
 """Largest difference of two commands of one publisher, as a fraction of that to the other's between them."""

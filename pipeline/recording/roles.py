@@ -8,13 +8,14 @@ import numpy as np
 
 from pipeline.core import Floats, enumerate_texts, format_duration
 from pipeline.recording.case import NO_CANDIDATE, Candidate, Case
+from pipeline.recording.drive import list_steered
 from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
+from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, Motion, compare, fit
 from pipeline.recording.readings import SIDES, UNEXPLAINED, Bent, Explained, Held, Reading
 from pipeline.recording.units import resolve_steering
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import COMMANDED, CONFIGURED, DriveForm, DriveSource, Sources
-from pipeline.stages import Finding, list_steered
 
 _STILL = 0.1
 """Gain of the motion on the drive below which a body stands: on ice it is .13 to .26 of the wheels."""

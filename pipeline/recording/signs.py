@@ -8,10 +8,10 @@ import numpy as np
 from pipeline.core import enumerate_texts, format_length
 from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
+from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit
 from pipeline.recording.readings import DELAYS_S, Reading
 from pipeline.sources import PoseContent
-from pipeline.stages import Finding
 
 _HALF_TURN = 180.0
 _AGREE = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}

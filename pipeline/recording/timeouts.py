@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.core import CONFIDENCE, NORMAL_95, Floats, Ints, fit_robustly, robust_spread, student_quantile
 from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import CLEAR, LEAST_NATS, NO_MOTION, Motion, compare
 from pipeline.recording.readings import (
@@ -26,7 +27,6 @@ from pipeline.recording.readings import (
     Reading,
 )
 from pipeline.run import LIVE_SHARE
-from pipeline.stages import Finding
 
 _PERIODS = 3.0
 """Gap in the commands [usual periods] above which they are silent: a shorter one is jitter."""

@@ -19,10 +19,10 @@ from pipeline.recording.evidence import (
     find_wheel_unit,
     is_unit_exact,
 )
+from pipeline.recording.findings import Finding
 from pipeline.recording.motion import measure_motion
 from pipeline.recording.readings import Bent
 from pipeline.sources import DriveForm, PoseContent, plain_type
-from pipeline.stages import Finding
 
 JOYSTICK = "sensor_msgs/Joy"
 """Type of axes, whose numbers from -1 to 1 have no unit."""

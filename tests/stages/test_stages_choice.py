@@ -13,7 +13,19 @@ from stage_logs import FIELD, PLAIN, TakeThrough
 from pipeline.core import rigid
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
+from pipeline.recording.clocks import Recorded, align_clocks
+from pipeline.recording.drive import read_joints, unwrap_counter
+from pipeline.recording.extract import Given, extract_tables
 from pipeline.recording.log_choice import Choice, choose
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.topic_values import (
+    PoseArrays,
+    find_angle_unit,
+    find_lean,
+    list_wanted,
+    put_upright,
+    read_pose_topic,
+)
 from pipeline.simulate import PoseSensor, Recording, Scenario, make_scenario, simulate_run, write_log
 from pipeline.sources import (
     Configuration,
@@ -22,18 +34,6 @@ from pipeline.sources import (
     find_preset,
     find_type,
     load_configuration,
-)
-from pipeline.stages.clocks import Recorded, align_clocks
-from pipeline.stages.drive import read_joints, unwrap_counter
-from pipeline.stages.extract import Given, extract_tables
-from pipeline.stages.log_columns import LogColumns
-from pipeline.stages.reading import (
-    PoseArrays,
-    find_angle_unit,
-    find_lean,
-    list_wanted,
-    put_upright,
-    read_pose_topic,
 )
 
 SECOND = 10**9

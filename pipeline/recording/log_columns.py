@@ -9,8 +9,8 @@ from typing import TypeVar, TypeVarTuple, cast
 import numpy as np
 
 from pipeline.logs import LogData, TopicColumns, join_channels
-from pipeline.stages import reading
-from pipeline.stages.findings import Finding
+from pipeline.recording import topic_values
+from pipeline.recording.findings import Finding
 
 Asked = TypeVarTuple("Asked")
 Made = TypeVar("Made")
@@ -33,7 +33,7 @@ class LogColumns:
     """
 
     def __init__(self, data: LogData) -> None:
-        topics, self.findings = reading.remove_absurd(data.topics)
+        topics, self.findings = topic_values.remove_absurd(data.topics)
         self.data = replace(data, topics=topics)
         self._joined: dict[str, tuple[TopicColumns | None, tuple[Finding, ...]]] = {}
         self._made: dict[object, list[tuple[tuple[object, ...], object]]] = {}
@@ -64,7 +64,7 @@ class LogColumns:
         """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
         # All texts of a topic may be unreadable.
         recorded = self.data.of(topic)
-        stamped = [reading.with_stamps(columns) for columns in recorded if columns.log_time.size]
+        stamped = [topic_values.with_stamps(columns) for columns in recorded if columns.log_time.size]
         channels = [columns for columns in stamped if columns.log_time.size]
         if len(channels) <= 1:
             return channels[0] if channels else None

@@ -12,6 +12,27 @@ from numpy.typing import NDArray
 
 from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, format_share
 from pipeline.logs import TopicColumns
+from pipeline.recording import pose_topics, topic_values
+from pipeline.recording.clocks import Recorded, TopicClock, align_clocks, find_pauses
+from pipeline.recording.drive import (
+    SIGNALS,
+    differentiate_angle,
+    interpolate_readings,
+    is_angle,
+    is_of_wheels,
+    read_joints,
+    read_pair,
+    read_rates,
+    read_signal,
+    read_speed,
+)
+from pipeline.recording.echo import check_echo
+from pipeline.recording.findings import Finding, StageError, blame_damage
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.lost_messages import fill_gaps
+from pipeline.recording.pose_topics import read_bodies
+from pipeline.recording.tilt import lean
+from pipeline.recording.topic_values import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.sources import (
     DEFAULT_INTERVAL,
     UNKNOWN_VEHICLE,
@@ -28,30 +49,9 @@ from pipeline.sources import (
     find_type,
     list_presets,
 )
-from pipeline.stages import pose_topics, reading
-from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_pauses
-from pipeline.stages.drive import (
-    SIGNALS,
-    differentiate_angle,
-    interpolate_readings,
-    is_angle,
-    is_of_wheels,
-    read_joints,
-    read_pair,
-    read_rates,
-    read_signal,
-    read_speed,
-)
-from pipeline.stages.findings import Finding, StageError, blame_damage
-from pipeline.stages.log_columns import LogColumns
-from pipeline.stages.lost_messages import fill_gaps
-from pipeline.stages.pose_topics import read_bodies
-from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside
-from pipeline.stages.tilt import lean
-from pipeline.stages.trust import check_echo
 
 if TYPE_CHECKING:
-    from pipeline.stages.satellite import Turning
+    from pipeline.recording.satellite import Turning
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
@@ -71,7 +71,7 @@ class Given:
     """A log with what is known of it: what its examination and its extraction start from.
 
     Attributes:
-        log: columns of the wanted topics (see `reading.list_wanted`).
+        log: columns of the wanted topics (see `topic_values.list_wanted`).
         sources: topic of each role; before an examination, candidates by type and name, the likeliest first.
         configuration: units, signs, clocks, intervals.
         vehicle: the log's, or `UNKNOWN_VEHICLE` of its kind.
@@ -93,7 +93,7 @@ class Given:
         """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
         drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
         return self.vehicle.kinematics.has_inputs("sideways") or any(
-            reading.find_sideways_share(self.log.data.topics, one) for one in drives
+            topic_values.find_sideways_share(self.log.data.topics, one) for one in drives
         )
 
 
@@ -154,7 +154,9 @@ class Extraction:
         if configuration.imu.unit == "deg/s":
             self.take_degrees()
         unfit = self.data.unfit
-        used = {one.topic for one in reading.list_wanted(sources, self.data.index.types)} if unfit else ()
+        used = (
+            {one.topic for one in topic_values.list_wanted(sources, self.data.index.types)} if unfit else ()
+        )
         self.findings += [self._report_left_out(one) for one in unfit if one.topic in used]
         pose = sources.pose
         drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
@@ -171,7 +173,7 @@ class Extraction:
         """Take the rates of the gyro for degrees a second, as `[imu] unit` does."""
         topic = "" if self.sources.imu is None else self.sources.imu.topic
         if topic in self.columns:
-            self.columns[topic] = reading.turn_to_radians(self.columns[topic])
+            self.columns[topic] = topic_values.turn_to_radians(self.columns[topic])
 
     def run(self) -> Extracted:
         """All tables."""
@@ -274,7 +276,7 @@ class Extraction:
             asked = [section for section in sections if section.topic] or [_DEFAULT_SECTION]
             if ordered is not None:
                 columns, clock, order = ordered
-                states = reading.texts(columns, "data")
+                states = topic_values.texts(columns, "data")
                 times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
                 for section in asked:
                     spans += find_spans_of_state(times, said, section)
@@ -299,7 +301,7 @@ class Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
-        position, quaternion, leant = reading.put_upright(arrays, self.configuration.pose)
+        position, quaternion, leant = topic_values.put_upright(arrays, self.configuration.pose)
         if leant:
             text = (
                 f"the frame of the poses of {source.topic} leans by {np.degrees(leant):.0f} degrees, as that "
@@ -335,7 +337,7 @@ class Extraction:
         imu = self._timed(self.sources.imu.topic) if self.sources.imu and source.wheels is None else None
         if imu is None:
             return position, quaternion
-        turn = pose_topics.find_turn(self.data.topics, reading.frame_of(imu.columns))
+        turn = pose_topics.find_turn(self.data.topics, topic_values.frame_of(imu.columns))
         leaning = self.log.once(lean, times, position, quaternion, imu, turn)
         if leaning is None:
             return position, quaternion
@@ -352,7 +354,7 @@ class Extraction:
         self.findings.append(Finding("slope_by_imu", "info", text, where="pose", value=steepest))
         return position, quaternion
 
-    def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+    def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, topic_values.PoseArrays, Flags]:
         """Stamps, log times and poses of base_link in time order, and clock jumps."""
         topic = source.topic
         clock, columns = self.clocks.get(topic), self.columns.get(topic)
@@ -362,7 +364,7 @@ class Extraction:
             return self._follow_wheels(source.wheels, clock)
         if self.chain is not None:
             chain, order = self.chain, self._order(clock)
-            arrays = reading.PoseArrays(
+            arrays = topic_values.PoseArrays(
                 chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
             )
             arrays, log_times = arrays.take(order), chain.log_time
@@ -388,7 +390,7 @@ class Extraction:
 
     def _follow_wheels(
         self, source: DriveSource, clock: TopicClock
-    ) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+    ) -> tuple[Stamps, Stamps, topic_values.PoseArrays, Flags]:
         """Stamps, log times and poses of measured wheels that roll without slip, and clock jumps."""
         wheels, findings = interpolate_readings(
             self.read_drive(source, self.configuration.wheels, held=False)
@@ -401,7 +403,7 @@ class Extraction:
             for one in kinematics.inputs
         }
         known = np.logical_and.reduce([np.isfinite(values) for values in inputs.values()])
-        if known.sum() < reading.FEWEST_MESSAGES:
+        if known.sum() < topic_values.FEWEST_MESSAGES:
             raise self._nothing("wheels", source.signals[0].topic)
         ahead, aside, turning = kinematics.forward(
             {name: values[known] for name, values in inputs.items()}, self.vehicle
@@ -416,7 +418,7 @@ class Extraction:
         moved = 0.5 * (velocity[1:] + velocity[:-1]) * elapsed * np.exp(1j * (yaw[:-1] + 0.5 * turned))
         path = np.append(0.0, np.cumsum(moved))
         flat = np.zeros(path.size)
-        arrays = reading.PoseArrays(
+        arrays = topic_values.PoseArrays(
             np.column_stack((path.real, path.imag, flat)),
             np.column_stack((flat, flat, np.sin(0.5 * yaw), np.cos(0.5 * yaw))),
             "",
@@ -436,11 +438,11 @@ class Extraction:
             hint = "Record the encoders, or a localization."
             raise StageError("no_pose", what, where=self.where, hint=hint)
 
-    def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
+    def _read_poses(self, source: PoseSource, columns: TopicColumns) -> topic_values.PoseArrays:
         pose = source.fields or find_type(columns.type_name).pose
         if pose is not None and pose.angle:
             asked = self.configuration.pose.yaw_unit
-            unit = asked or reading.find_angle_unit(columns, pose)
+            unit = asked or topic_values.find_angle_unit(columns, pose)
             if unit != (asked or pose.angle_unit):
                 text = (
                     f"the headings of {source.topic} are in degrees: the body moves along them; converted, "
@@ -449,13 +451,15 @@ class Extraction:
                 self.findings.append(Finding("heading_unit", "warning", text, where=source.topic))
             pose = msgspec.structs.replace(pose, angle_unit=unit)
         if pose is None or not pose.names:
-            return reading.read_pose_topic(columns, pose)
+            return topic_values.read_pose_topic(columns, pose)
         arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
         text = f"of the bodies of {source.topic}, {name!r} is the vehicle"
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
         return arrays
 
-    def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> reading.Located | None:
+    def _head_positions(
+        self, source: PoseSource, arrays: topic_values.PoseArrays
+    ) -> topic_values.Located | None:
         """Poses with the course as heading if a topic gives positions alone; otherwise None.
 
         A vehicle that moves sideways may keep one heading.
@@ -467,7 +471,7 @@ class Extraction:
             or not pose_topics.lacks_heading(arrays)
         ):
             return None
-        from pipeline.stages.satellite import head_positions  # noqa: PLC0415 - few logs need it
+        from pipeline.recording.satellite import head_positions  # noqa: PLC0415 - few logs need it
 
         located = head_positions(arrays, receiver, self._list_turnings(source), self._read_ahead())
         self.findings += () if located is None else located.findings
@@ -478,21 +482,21 @@ class Extraction:
         drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
         return next((drive for drive in drives if drive is not None), None)
 
-    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
+    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, topic_values.PoseArrays]:
         """Messages of a satellite receiver that give a pose, in time order, and these poses."""
-        from pipeline.stages.satellite import locate_vehicle  # noqa: PLC0415 - few logs need it
+        from pipeline.recording.satellite import locate_vehicle  # noqa: PLC0415 - few logs need it
 
         receiver, beside = self._timed(source.topic), self._timed(source.velocity)
         if receiver is None:
             raise self._nothing("pose", source.topic)
         lever, findings = pose_topics.find_antenna(
-            self.data.topics, reading.frame_of(receiver.columns), source.topic
+            self.data.topics, topic_values.frame_of(receiver.columns), source.topic
         )
         made = locate_vehicle(receiver, beside, self._list_turnings(source), self._read_ahead(), lever)
         self.findings += [*findings, *made.findings]
         if not made.rows.size:
             times = receiver.times[receiver.order]
-            if times.size < reading.FEWEST_MESSAGES:
+            if times.size < topic_values.FEWEST_MESSAGES:
                 raise self._nothing("pose", source.topic)
             rate = 1.0 / max(float(np.median(np.diff(times))), 1e-3)
             slow = f" (at least {pose_topics.SLOW_HZ:g} Hz are needed)" if rate < pose_topics.SLOW_HZ else ""
@@ -506,7 +510,7 @@ class Extraction:
 
     def _list_turnings(self, source: PoseSource) -> list["Turning"]:
         """Sensors that turn with a vehicle of which positions alone are recorded."""
-        from pipeline.stages.satellite import list_turnings, read_headings  # noqa: PLC0415 - few logs need it
+        from pipeline.recording.satellite import list_turnings, read_headings  # noqa: PLC0415 - few logs need it
 
         imu = self._timed(self.sources.imu.topic) if self.sources.imu else None
         turnings = [] if imu is None else list_turnings(imu)
@@ -515,14 +519,14 @@ class Extraction:
             turnings += [] if number is None else read_headings(number, signal.field)
         return turnings
 
-    def _timed(self, topic: str) -> reading.Receiver | None:
+    def _timed(self, topic: str) -> topic_values.Receiver | None:
         ordered = self._ordered(topic)
         if ordered is None:
             return None
         columns, clock, order = ordered
         # Messages with equal stamps have no position on a track.
         order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
-        return reading.Receiver(columns, self._seconds(clock.stamp), order)
+        return topic_values.Receiver(columns, self._seconds(clock.stamp), order)
 
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}
@@ -576,7 +580,7 @@ class Extraction:
         else:
             stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
             topic = source.signals[0].topic
-            nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
+            nominal = not held and topic_values.is_of_base(source, {topic: self.columns[topic].type_name})
             sideways = self._read_sideways(source, held=held)
             drive = read_pair(
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
@@ -662,7 +666,7 @@ class Extraction:
         if source.form is not DriveForm.BODY:
             return None
         topic = source.signals[0].topic
-        signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
+        signal = topic_values.sideways_field(source, {topic: self.columns[topic].type_name})
         moves = self.vehicle.kinematics.has_inputs("sideways")
         if signal is None:
             if moves and not held:
@@ -672,14 +676,14 @@ class Extraction:
             return None
         columns, _, order = self._require(topic, held=held)
         # A message without the number asks for none.
-        sideways = np.nan_to_num(reading.numbers(columns, signal.field)[order])
+        sideways = np.nan_to_num(topic_values.numbers(columns, signal.field)[order])
         if not moves and held:
             self.findings += self._check_sideways(sideways, topic)
         return sideways if moves else None
 
     def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
         """Commands that this kind of vehicle cannot follow, since it moves along its wheels only."""
-        share = reading.asks_sideways(sideways)
+        share = topic_values.asks_sideways(sideways)
         if share == 0.0:
             return []
         text = (
@@ -721,7 +725,7 @@ class Extraction:
         if ordered is None:
             return pl.DataFrame()
         columns, clock, order = ordered
-        rates, forces = reading.read_imu(columns)
+        rates, forces = topic_values.read_imu(columns)
         times = self._seconds(clock.stamp[order])
         return pl.DataFrame(
             {

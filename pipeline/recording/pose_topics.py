@@ -18,9 +18,9 @@ from pipeline.logs import (
     TransformBuffer,
     TransformSeries,
 )
+from pipeline.recording.findings import Finding, StageError
+from pipeline.recording.topic_values import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 from pipeline.sources import PoseFields, PoseSource, Vehicle, VelocitySection, is_localization, plain_type
-from pipeline.stages.findings import Finding, StageError
-from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
