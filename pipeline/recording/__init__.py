@@ -2,8 +2,8 @@
 
 Columns in, tables at one clock and one `Recording` out: every question of `examination.QUESTIONS` is decided
 here, with its evidence, its rivals and the line of run.toml that decides otherwise, and nothing decides it
-again. The completed configuration holds the answers, so that the stages after take a recording as a user could
-have described it by hand.
+again. The completed configuration holds the answers, so that the stages after take a recording as a user
+could have described it by hand.
 """
 
 from collections.abc import Mapping
