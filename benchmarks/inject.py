@@ -141,9 +141,9 @@ def inject(log: Path, injection: Injection) -> Iterator[None]:
         return changed.get("imu", recorded) if str(self.sources.imu) == str(sources.imu) else recorded
 
     def read_changed(
-        self: Extraction, source: DriveSource | None, section: DriveSection, *, held: bool
+        self: Extraction, source: DriveSource | None, section: DriveSection, reader: Vehicle, *, held: bool
     ) -> pl.DataFrame:
-        table = read_drive(self, source, section, held=held)
+        table = read_drive(self, source, section, reader, held=held)
         for role, own in (("commands", sources.command), ("wheels", sources.wheels)):
             is_own = source is not None and own is not None and source.signals == own.signals
             if is_own and changed.get(role) is not tables.get(role):

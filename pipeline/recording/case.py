@@ -226,9 +226,9 @@ class Case:
     ) -> Reading:
         """The signals of a source, with unit lengths; nothing if they cannot be read as the user says."""
         section = section or self.find_section(source, is_measured=is_measured)
-        self.extraction.vehicle = unit = self.make_unit(source, kind)
+        unit = self.make_unit(source, kind)
         try:
-            table = self.extraction.read_drive(source, section, held=True)
+            table = self.extraction.read_drive(source, section, unit, held=True)
         except SlipError:
             return Reading()
         if source.form is DriveForm.BODY:
@@ -243,7 +243,7 @@ class Case:
         reading = Reading("sides", str(source), *(_hold(table, name) for name in names))
         if self.moves_sideways and section.reversed is None:
             backward = msgspec.structs.replace(section, reversed="right")
-            table = self.extraction.read_drive(source, backward, held=True)
+            table = self.extraction.read_drive(source, backward, unit, held=True)
             return replace(reading, third_crossed=_hold(table, "sideways"))
         return reading
 

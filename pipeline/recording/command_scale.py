@@ -236,12 +236,11 @@ def ask_scale(case: Case) -> Case:
     vehicle, made = case.vehicle, case.complete()
     if case.kind and not case.is_known:
         vehicle = msgspec.structs.replace(vehicle, kind=case.kind)
-    case.extraction.vehicle = vehicle
     try:
-        asked = case.extraction.read_drive(command.source, made.command, held=True)
+        asked = case.extraction.read_drive(command.source, made.command, vehicle, held=True)
         got = pl.DataFrame()
         if wheels.is_there:
-            got = case.extraction.read_drive(wheels.source, made.wheels, held=False)
+            got = case.extraction.read_drive(wheels.source, made.wheels, vehicle, held=False)
     except SlipError:
         return case
     is_body = command.reading.form == "body"

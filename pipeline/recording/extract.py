@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 import numpy as np
@@ -151,8 +151,13 @@ class Extraction:
             self.findings += findings
             if joined is not None:
                 self.columns[topic] = joined
-        if configuration.imu.unit == "deg/s":
-            self.take_degrees()
+        if (
+            configuration.imu.unit == "deg/s"
+            and sources.imu is not None
+            and sources.imu.topic in self.columns
+        ):
+            turned = topic_values.turn_to_radians(self.columns[sources.imu.topic])
+            self.columns[sources.imu.topic] = turned
         unfit = self.data.unfit
         used = (
             {one.topic for one in topic_values.list_wanted(sources, self.data.index.types)} if unfit else ()
@@ -169,11 +174,10 @@ class Extraction:
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
-    def take_degrees(self) -> None:
-        """Take the rates of the gyro for degrees a second, as `[imu] unit` does."""
-        topic = "" if self.sources.imu is None else self.sources.imu.topic
-        if topic in self.columns:
-            self.columns[topic] = topic_values.turn_to_radians(self.columns[topic])
+    def configure(self, **sections: object) -> Self:
+        """The same log with other sections of the configuration."""
+        configuration = msgspec.structs.replace(self.configuration, **sections)
+        return type(self)(Given(self.log, self.sources, configuration, self.vehicle, self.where))
 
     def run(self) -> Extracted:
         """All tables."""
@@ -393,7 +397,7 @@ class Extraction:
     ) -> tuple[Stamps, Stamps, topic_values.PoseArrays, Flags]:
         """Stamps, log times and poses of measured wheels that roll without slip, and clock jumps."""
         wheels, findings = interpolate_readings(
-            self.read_drive(source, self.configuration.wheels, held=False)
+            self.read_drive(source, self.configuration.wheels, self.vehicle, held=False)
         )
         self.findings += findings
         self._refuse_echo(wheels)
@@ -541,7 +545,8 @@ class Extraction:
 
     @cached_property
     def _commands(self) -> pl.DataFrame:
-        table = self.read_drive(self.sources.command, self.configuration.command, held=True)
+        section = self.configuration.command
+        table = self.read_drive(self.sources.command, section, self.vehicle, held=True)
         beside = self.sources.body_beside
         if beside is None or table.is_empty():
             return table
@@ -560,30 +565,33 @@ class Extraction:
             pl.Series(name, np.where(at >= 0, value, np.nan)).fill_nan(None) for name, value in values.items()
         )
 
-    def read_drive(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
-        """Table of a drive, in the inputs of `vehicle`; empty without one.
+    def read_drive(
+        self, source: DriveSource | None, section: DriveSection, vehicle: Vehicle, *, held: bool
+    ) -> pl.DataFrame:
+        """Table of a drive; empty without one.
 
         Args:
             source: its topics.
             section: units, signs and names of joints.
+            vehicle: in whose inputs it is.
             held: whether its values are commands, held until the next one.
         """
         if source is None:
             return pl.DataFrame()
         if source.form is DriveForm.JOINTS:
             columns, clock, order = self._require(source.signals[0].topic, held=held)
-            drive, findings = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
+            drive, findings = read_joints(columns, self._seconds(clock.stamp), section, vehicle)
             self.findings += findings
             order = order[is_of_wheels(columns, drive)[order]]
             drive = {name: series[order] for name, series in drive.items()}
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
-            stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
+            stamp, log_time, (first, second) = self._read_pair(source, section, vehicle, held=held)
             topic = source.signals[0].topic
             nominal = not held and topic_values.is_of_base(source, {topic: self.columns[topic].type_name})
-            sideways = self._read_sideways(source, held=held)
+            sideways = self._read_sideways(source, vehicle, held=held)
             drive = read_pair(
-                source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
+                source.form, first, second, section, vehicle, nominal=nominal, sideways=sideways
             )
         if section.late_s:
             stamp = stamp - round(section.late_s * 1e9)
@@ -643,7 +651,7 @@ class Extraction:
         source = self.sources.wheels
         section = self.configuration.wheels
         try:
-            return self.read_drive(source, section, held=False)
+            return self.read_drive(source, section, self.vehicle, held=False)
         except SlipError as error:
             if source is None or section != DriveSection():
                 raise
@@ -657,7 +665,7 @@ class Extraction:
             raise self._nothing("command" if held else "wheels", topic)
         return ordered
 
-    def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
+    def _read_sideways(self, source: DriveSource, vehicle: Vehicle, *, held: bool) -> Floats | None:
         """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None if it has none.
 
         Raises:
@@ -667,10 +675,10 @@ class Extraction:
             return None
         topic = source.signals[0].topic
         signal = topic_values.sideways_field(source, {topic: self.columns[topic].type_name})
-        moves = self.vehicle.kinematics.has_inputs("sideways")
+        moves = vehicle.kinematics.has_inputs("sideways")
         if signal is None:
             if moves and not held:
-                what = f"{source} does not say how {self.vehicle.name} moves sideways"
+                what = f"{source} does not say how {vehicle.name} moves sideways"
                 hint = "Configure an odometry, or a JointState of all wheels."
                 raise StageError("no_sideways", what, where=topic, hint=hint)
             return None
@@ -678,17 +686,17 @@ class Extraction:
         # A message without the number asks for none.
         sideways = np.nan_to_num(topic_values.numbers(columns, signal.field)[order])
         if not moves and held:
-            self.findings += self._check_sideways(sideways, topic)
+            self.findings += self._check_sideways(sideways, topic, vehicle)
         return sideways if moves else None
 
-    def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
+    def _check_sideways(self, sideways: Floats, topic: str, vehicle: Vehicle) -> list[Finding]:
         """Commands that this kind of vehicle cannot follow, since it moves along its wheels only."""
         share = topic_values.asks_sideways(sideways)
         if share == 0.0:
             return []
         text = (
             f"{format_share(share)} of the commands of {topic} ask for sideways motion, which "
-            f"{self.vehicle.name} ({self.vehicle.kind}) cannot do, and that motion is left out: are its "
+            f"{vehicle.name} ({vehicle.kind}) cannot do, and that motion is left out: are its "
             'wheels mecanum or omni wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in '
             "run.toml, or --vehicle "
             f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
@@ -696,13 +704,13 @@ class Extraction:
         return [Finding("sideways_command", "error", text, where=topic, value=share)]
 
     def _read_pair(
-        self, source: DriveSource, section: DriveSection, *, held: bool
+        self, source: DriveSource, section: DriveSection, vehicle: Vehicle, *, held: bool
     ) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
         """Two signals at common times: held commands at all stamps, measurements at those of the first."""
         series = []
         for number, signal in enumerate(source.signals):
             columns, clock, order = self._require(signal.topic, held=held)
-            values = read_signal(columns, source, number, section, self.vehicle)[order]
+            values = read_signal(columns, source, number, section, vehicle)[order]
             if is_angle(source, section):
                 values = differentiate_angle(self._seconds(clock.stamp[order]), values)
             series.append((clock.stamp[order], columns.log_time[order], values))

@@ -413,8 +413,9 @@ def ask_outages(case: Case) -> Case:
     if not outages:
         return case
     kind = "ackermann" if reading.form == "steering" else "differential"
-    case.extraction.vehicle = case.make_unit(wheels.source, kind)
-    table = case.extraction.read_drive(wheels.source, section, held=False)
+    table = case.extraction.read_drive(
+        wheels.source, section, case.make_unit(wheels.source, kind), held=False
+    )
     stamps = table["t"].to_numpy()
     clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
     words = {

@@ -47,8 +47,8 @@ def ask_publishers(case: Case) -> Case:
     live = np.linalg.norm(asked, axis=1) > 0.0
     inside = np.logical_or.reduce([(times >= start) & (times <= end) for start, end in spans])
     zeros = float(np.mean(~live[inside]))
-    case.extraction.vehicle = case.make_unit(command.source, "differential")
-    table = case.extraction.read_drive(command.source, case.complete().command, held=True)
+    unit = case.make_unit(command.source, "differential")
+    table = case.extraction.read_drive(command.source, case.complete().command, unit, held=True)
     clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
     ends = [np.interp(span, table["t"].to_numpy(), clock).tolist() for span in spans]
     when = f"from {ends[0][0]:.0f} to {ends[0][1]:.0f} s"

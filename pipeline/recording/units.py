@@ -44,7 +44,7 @@ def ask_gyro(case: Case) -> Case:
     what = f"the gyro of {gyro.name} is in degrees per second"
     case.correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
     # Headings of positions alone are made of the gyro.
-    case.extraction.take_degrees()
+    case = replace(case, extraction=case.extraction.configure(imu=case.complete().imu))
     again = measure_motion(case.extraction.poses())
     return replace(case, gyro=case.read_gyro()).fit(again if again.is_known else case.motion)
 
@@ -63,7 +63,7 @@ def ask_metres(case: Case) -> Case:
     if unit == "m":
         return case
     case.correct("pose", f"the positions of {source} are in {unit}", f'unit = "{unit}"', {"unit": unit})
-    case.extraction.configuration = case.complete()
+    case = replace(case, extraction=case.extraction.configure(pose=case.complete().pose))
     scaled = measure_motion(case.extraction.poses())
     return case.fit(scaled.turn(flip=motion.flip, offset_deg=motion.offset_deg)) if scaled.is_known else case
 
