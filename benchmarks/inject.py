@@ -33,12 +33,11 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.logs import read_topics
 from pipeline.models import find_effect
+from pipeline.recording import Extraction, Given, extract_tables
 from pipeline.recording.log_setup import set_up_log
 from pipeline.results import Named, Value
 from pipeline.sources import DriveSection, DriveSource, Sources, Vehicle
-from pipeline.stages import Extraction, Given, extract_tables, list_wanted
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
@@ -118,9 +117,9 @@ class Answer:
 def _extract(log: Path) -> tuple[Sources, Vehicle, Mapping[str, pl.DataFrame]]:
     """Sources, vehicle and tables of a recording as it is."""
     setup = set_up_log(log, Options(out=Path()))
-    data = setup.choice.data if setup.choice.extracted is None else None
-    data = data or read_topics(setup.index, list_wanted(setup.sources, setup.index.types))
-    made = extract_tables(Given(data, setup.sources, setup.configuration, setup.vehicle, str(log)))
+    made = extract_tables(
+        Given(setup.choice.take_log(), setup.sources, setup.configuration, setup.vehicle, str(log))
+    )
     return setup.sources, setup.vehicle, made.tables
 
 
@@ -142,9 +141,9 @@ def inject(log: Path, injection: Injection) -> Iterator[None]:
         return changed.get("imu", recorded) if str(self.sources.imu) == str(sources.imu) else recorded
 
     def read_changed(
-        self: Extraction, source: DriveSource | None, section: DriveSection, *, held: bool
+        self: Extraction, source: DriveSource | None, section: DriveSection, reader: Vehicle, *, held: bool
     ) -> pl.DataFrame:
-        table = read_drive(self, source, section, held=held)
+        table = read_drive(self, source, section, reader, held=held)
         for role, own in (("commands", sources.command), ("wheels", sources.wheels)):
             is_own = source is not None and own is not None and source.signals == own.signals
             if is_own and changed.get(role) is not tables.get(role):

@@ -14,7 +14,7 @@ import msgspec
 
 from pipeline.analysis import STAGES, Options
 from pipeline.analysis.summary import diagnose_work, find_peers, judge_run, list_versions, summarize_run
-from pipeline.analysis.work import Progress, Work, hash_model, key_stages, read_wanted
+from pipeline.analysis.work import Progress, Work, hash_model, key_stages
 from pipeline.core import (
     FIGURES,
     INPUTS,
@@ -27,7 +27,7 @@ from pipeline.core import (
     require_package,
 )
 from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
-from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
+from pipeline.logs import LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_result
 from pipeline.store import (
@@ -106,7 +106,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     setup = set_up_log(path, options)
     # The setup restores addresses that the command line altered.
     path = setup.path
-    sha256, data = _identify(path, setup, store, progress)
+    sha256 = _identify(path, setup, store, progress)
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
     current = store.manifest(run)
@@ -121,9 +121,9 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         if previous is not None and not options.force and _is_done(previous, keys, options):
             # Another process has written the requested results in the meantime.
             return Outcome(_read_summary(previous, options), previous, (), twin)
-        work = Work(run, setup, options, generation, keys, sha256, data, progress)
+        work = Work(run, setup, options, generation, keys, sha256, progress)
         # Keep no reference, so that the stages can free the columns once the tables exist.
-        del setup, data
+        del setup
         work.run_stages()
         log, verdict = _summarize_log(work.setup, sha256, work), ""
         if options.through == STAGES[-1]:
@@ -158,18 +158,15 @@ def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
     return ""
 
 
-def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> tuple[str, LogData | None]:
-    """Hash of the log, cached or computed while reading it, and the data that were read."""
+def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> str:
+    """Hash of the log, cached or computed while it was read."""
     identities = LogIdentities(store)
     known = identities.lookup(path)
-    read = setup.choice.data
-    if known is not None:
-        return known, read
-    progress("read")
-    seen = see_log(path)
-    data = read_wanted(setup) if read is None else read
-    identities.remember(path, data.sha256, seen=seen)
-    return data.sha256, data
+    if known is None:
+        progress("read")
+        known = setup.choice.take_log().data.sha256
+        identities.remember(path, known, seen=see_log(path))
+    return known
 
 
 def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> bool:

@@ -20,6 +20,7 @@ from pipeline.estimation.stored_diagnosis import (
     show_model,
 )
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
+from pipeline.recording import Finding, list_wanted
 from pipeline.recording.log_setup import LogSetup
 from pipeline.results import (
     RunDiagnosis,
@@ -29,7 +30,7 @@ from pipeline.results import (
     read_result,
     to_json,
 )
-from pipeline.stages import SUMMARY_DIGITS, Finding, list_wanted, pick_row, round_number, summarize_inputs
+from pipeline.stages import SUMMARY_DIGITS, pick_row, round_number, summarize_inputs
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store
 
 _Packages = Mapping[str, tuple[str, ...]]

@@ -13,22 +13,13 @@ import polars as pl
 from pipeline.analysis import STAGES, Options
 from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory
 from pipeline.estimation.stored_diagnosis import add_model
-from pipeline.logs import OVER_BUDGET, LogData, Loss, read_topics
+from pipeline.logs import OVER_BUDGET, Loss
+from pipeline.recording import POSE_FINDINGS, Finding, Given, extract_tables
 from pipeline.recording.log_setup import LogSetup
 from pipeline.results import round_numbers
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
-from pipeline.stages import (
-    POSE_FINDINGS,
-    Finding,
-    Given,
-    align_tables,
-    checks,
-    extract_tables,
-    list_wanted,
-    slip_stage,
-    velocity,
-)
+from pipeline.stages import align_tables, checks, slip_stage, velocity
 from pipeline.store import (
     JSON,
     CheckedTable,
@@ -91,7 +82,6 @@ class Work:
         generation: generation that the tables are written to.
         keys: key of every stage.
         sha256: hash of the log.
-        data: columns of the log, if they have been read already.
         progress: callback, called with the current step.
     """
 
@@ -101,7 +91,6 @@ class Work:
     generation: Generation
     keys: Mapping[str, str]
     sha256: str
-    data: LogData | None
     progress: Progress
     contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
     findings: list[pl.DataFrame] = field(default_factory=list)
@@ -189,21 +178,12 @@ class Work:
 
     def _extract(self) -> StageOutcome:
         setup = self.setup
-        data = self.data if self.data is not None else read_wanted(setup, self.sha256)
-        known = setup.choice.recording
-        made = extract_tables(
-            Given(
-                data,
-                setup.sources,
-                setup.configuration,
-                setup.vehicle,
-                str(setup.path),
-                None if known is None else known.cut,
-            )
-        )
+        log = setup.choice.take_log()
+        made = extract_tables(Given(log, setup.sources, setup.configuration, setup.vehicle, str(setup.path)))
         # Columns and tables are large: drop the references as early as possible.
-        self.data, data = None, replace(data, topics=())
-        self.setup = replace(setup, choice=replace(setup.choice, data=None))
+        data = replace(log.data, topics=())
+        del log
+        self.setup = replace(setup, choice=replace(setup.choice, log=None))
         extracted = {
             name: check_table(name, self._identify(name, as_recorded(name, frame)))
             for name, frame in made.tables.items()
@@ -358,11 +338,6 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
             pl.col(name).alias(f"{name}_aligned") for name in names if name in frame.columns
         )
     return frame
-
-
-def read_wanted(setup: LogSetup, sha256: str | None = None) -> LogData:
-    """Read the columns that a run needs; the hash is computed at the same time unless it is known."""
-    return read_topics(setup.index, list_wanted(setup.sources, setup.index.types), sha256=sha256)
 
 
 def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:

@@ -46,9 +46,8 @@ from pipeline.core import (
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import Outcome
-    from pipeline.recording import Recording
+    from pipeline.recording import PoseRating, Recording
     from pipeline.recording.inspection import Inspection, TopicHealth
-    from pipeline.stages import PoseRating
 
     Content = Mapping[str, object]
 

@@ -20,8 +20,8 @@ from pipeline.core import Flags, Floats
 from pipeline.estimation.decision import LEAST_T, list_costs
 from pipeline.estimation.folds import refit
 from pipeline.estimation.held_out import find_in_test, refit_fold, score
+from pipeline.recording import Finding
 from pipeline.results import CHANGE, ERRORS_OVER_2S
-from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

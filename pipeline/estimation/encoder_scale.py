@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from pipeline.models import find_effect
+from pipeline.recording import Finding
 from pipeline.results import Named, RunDiagnosis, Value
 from pipeline.run import MotionRun
-from pipeline.stages import Finding
 
 GIVEN: Final = "encoder_scale_given"
 """Finding of a run whose configuration says the scale: it is not estimated."""

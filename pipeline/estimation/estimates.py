@@ -28,6 +28,7 @@ from pipeline.models import (
     list_effects,
     stands_at_bound,
 )
+from pipeline.recording import Finding
 from pipeline.results import (
     BREVITY,
     SEARCH_CUT,
@@ -38,7 +39,6 @@ from pipeline.results import (
     Value,
 )
 from pipeline.run import MotionRun
-from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     from pipeline.core import Budget

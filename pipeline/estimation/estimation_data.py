@@ -27,6 +27,7 @@ from pipeline.models import (
     is_of_one_run,
     list_effects,
 )
+from pipeline.recording import SLOW_HZ
 from pipeline.run import (
     GROUND_UNOBSERVABLE,
     HeadingSource,
@@ -34,7 +35,6 @@ from pipeline.run import (
     MotionRun,
 )
 from pipeline.sources import Vehicle
-from pipeline.stages import SLOW_HZ
 
 if TYPE_CHECKING:
     from pipeline.estimation.candidates import Candidate

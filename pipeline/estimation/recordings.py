@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from pipeline.recording import Finding
 from pipeline.results import read_finding_table
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle
-from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     import polars as pl

@@ -12,10 +12,11 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import INPUTS, PathError, SlipError
+from pipeline.recording import Finding
 from pipeline.results import RunDiagnosis, read_model, read_result, to_json
 from pipeline.run import MotionError, load_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
-from pipeline.stages import Finding, set_residuals, slip_stage, summarize_inputs
+from pipeline.stages import set_residuals, slip_stage, summarize_inputs
 from pipeline.store import (
     DIAGNOSIS,
     JSON,

@@ -10,9 +10,10 @@ import msgspec
 from pipeline.core import SlipError
 from pipeline.estimation.conclude import refuse
 from pipeline.estimation.diagnosis import Diagnosis
+from pipeline.recording import Finding
 from pipeline.results import RunDiagnosis, find_refusal
 from pipeline.run import MotionRun, load_run
-from pipeline.stages import WRONG_RADIUS, Finding, find_gain_of, is_grip
+from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -1,8 +1,9 @@
 """The front door of a log: which signals are its command, its wheels and its pose, in which frame and unit.
 
-Columns in, one `Recording` out: every question is decided here, with its evidence, its rivals and the line of
-run.toml that decides otherwise, and nothing decides it again. The completed configuration holds the answers,
-so that the stages after read a recording as a user could have described it by hand.
+Columns in, tables at one clock and one `Recording` out: every question of `examination.QUESTIONS` is decided
+here, with its evidence, its rivals and the line of run.toml that decides otherwise, and nothing decides it
+again. The completed configuration holds the answers, so that the stages after take a recording as a user
+could have described it by hand.
 """
 
 from collections.abc import Mapping
@@ -11,18 +12,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core import INPUTS, SlipError
+from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    from pipeline.recording.examination import Recording, examine, examine_drive
-
-__all__ = [
-    "FAULTS",
-    "LogOptions",
-    "Recording",
-    "RecordingError",
-    "examine",
-    "examine_drive",
-]
+    from pipeline.recording.clocks import *
+    from pipeline.recording.drive import *
+    from pipeline.recording.echo import *
+    from pipeline.recording.examination import *
+    from pipeline.recording.extract import *
+    from pipeline.recording.findings import *
+    from pipeline.recording.hypotheses import *
+    from pipeline.recording.log_columns import *
+    from pipeline.recording.lost_messages import *
+    from pipeline.recording.pose_choice import *
+    from pipeline.recording.pose_topics import *
+    from pipeline.recording.topic_values import *
+else:
+    __getattr__ = open_door(
+        __name__,
+        {
+            "clocks": ("find_pauses",),
+            "drive": ("SIGNALS", "interpolate_readings"),
+            "echo": ("check_echo",),
+            "examination": ("Recording", "examine"),
+            "extract": ("Extracted", "Extraction", "Given", "extract_tables"),
+            "findings": ("SURE", "Finding", "Severity", "StageError", "blame_damage"),
+            "hypotheses": ("BLOCK_S", "LASTS_NATS", "follow_likeliest", "price_change"),
+            "log_columns": ("LogColumns",),
+            "lost_messages": ("number_gaps",),
+            "pose_choice": ("ONE_SCALE", "PoseRating", "find_steady_gain", "measure_rest"),
+            "pose_topics": ("POSE_FINDINGS", "SLOW_HZ"),
+            "topic_values": ("list_wanted",),
+        },
+    )
 
 
 class RecordingError(SlipError):
@@ -60,12 +82,3 @@ FAULTS = (
     "pose_flipped",
 )
 """Findings each of which makes every fit meaningless."""
-
-
-def __getattr__(name: str) -> object:
-    # The verdict on a stored run needs the names of faults only.
-    if name not in __all__:
-        raise AttributeError(name)
-    from pipeline.recording import examination  # noqa: PLC0415
-
-    return getattr(examination, name)

@@ -1,4 +1,6 @@
-"""One log while it is examined: how its signals are read, and what was corrected so far."""
+"""One log while it is examined: how its signals are read, and what is decided so far."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -9,17 +11,21 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError
 from pipeline.recording.evidence import RATES, RIMS, SPEEDS, WHEELS, Axis, Units
-from pipeline.recording.motion import CLEAR, Motion
-from pipeline.recording.readings import Bent, Explained, Held, Reading
+from pipeline.recording.extract import Extraction, Given
+from pipeline.recording.findings import Finding
+from pipeline.recording.geometry import Geometry, roll_wheels
+from pipeline.recording.motion import CLEAR, NO_MOTION, Motion
+from pipeline.recording.readings import NO_SIGNAL, UNEXPLAINED, Bent, Explained, Held, Reading
+from pipeline.run import Alignment
 from pipeline.sources import (
     CONFIGURED,
     Configuration,
     DriveForm,
     DriveSection,
     DriveSource,
+    Sources,
     Vehicle,
 )
-from pipeline.stages import Extraction, Finding, Given
 
 TAKEN_M = 0.1
 """Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
@@ -39,12 +45,12 @@ _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
 """Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A candidate for a command or for wheels.
 
     Attributes:
-        source: its topics.
+        source: its topics; none where the log has nothing for the role.
         reading: its signals.
         rank: its place by type and name among those of its role.
         is_measured: whether type and name say that it is measured.
@@ -60,13 +66,22 @@ class Candidate:
     is_angle: bool = False
 
     @property
+    def is_there(self) -> bool:
+        """Whether the log has it."""
+        return bool(self.source.signals)
+
+    @property
     def is_sure(self) -> bool:
         """Whether the motion follows it."""
-        return self.reading.explained is not None and self.reading.explained.is_sure
+        return self.reading.explained.is_sure
 
     def sign(self, axis: Axis) -> int:
-        """Sign against the pose; zero where it is not clear."""
-        return self.reading.explained.sign(axis) if self.reading.explained is not None else 0
+        """Sign against the motion; zero where it is not clear."""
+        return self.reading.explained.sign(axis)
+
+    def is_of(self, source: DriveSource | None) -> bool:
+        """Whether it is that of a source."""
+        return source is not None and self.source.signals == source.signals
 
     def sign_as_motion(self, axis: Axis) -> int:
         """The same of a signal that states a motion.
@@ -75,14 +90,12 @@ class Candidate:
         changes no size.
         """
         explained = self.reading.explained
-        is_far = (
-            explained is not None
-            and self.reading.form == "body"
-            and abs(float(explained.turned.gains[0])) > _MOST_GAIN
-        )
+        is_far = self.reading.form == "body" and abs(float(explained.turned.gains[0])) > _MOST_GAIN
         return 0 if axis == "turned" and is_far else self.sign(axis)
 
 
+NO_CANDIDATE = Candidate(DriveSource(DriveForm.BODY, (), ""), Reading(), 0, is_measured=False)
+"""What a log has for a role for which it has nothing."""
 _MOST_GAIN = 2.0
 """Largest turn of a body over that which a signal states as its motion."""
 
@@ -90,57 +103,118 @@ _MOST_GAIN = 2.0
 def is_crossed(drive: Candidate) -> bool:
     """Whether one side counts backward: by the motion ahead, of a body command by turning, too."""
     explained = drive.reading.explained
-    if explained is None or not explained.crossed:
+    if not explained.crossed:
         return False
     sizes = [abs(float(explained.ahead.t[0])), abs(float(explained.turned.t[0]))]
     return sizes[0] > CLEAR and (drive.reading.form == "sides" or sizes[1] > CLEAR)
 
 
+@dataclass(frozen=True, eq=False)
 class Case:
-    """One log: its candidates, and what was decided so far."""
+    """One log and all that is decided of it: what a question is asked with, and what it answers by.
 
-    def __init__(self, given: Given) -> None:
-        self.is_known = given.is_known
-        self.sources, self.configuration, self.vehicle = given.sources, given.configuration, given.vehicle
-        # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
-        equal = replace(self.sources, others={**self.sources.others, "command": ()})
-        self.findings: list[Finding] = []
-        self.changes: dict[str, dict[str, object]] = {}
-        self.extraction = Extraction(replace(given, sources=equal))
-        self.ahead = _find_ahead(self)
-        if self.ahead is not None:
-            equal = replace(equal, command=self.ahead[0])
-            section = msgspec.structs.replace(self.configuration.command, time="log")
-            by_log = msgspec.structs.replace(self.configuration, command=section)
-            self.extraction = Extraction(replace(given, sources=equal, configuration=by_log))
-        self.moves_sideways = given.may_move_sideways(self.sources)
-        self.driven: Explained | None = None
-        # Whether what is commanded has a unit, so that the controller's lengths can be told from it.
-        self.is_scaled = True
-        # Whether the body hardly moves where the drive does.
-        self.is_still = False
-        # Whether the base stops before the next command, by which its gain is not known.
-        self.in_bursts = False
+    A question gives the case with its own answer; nothing that is decided is edited later. Findings and
+    corrections are added only.
 
-    def leave_out(self, source: DriveSource) -> None:
+    Attributes:
+        given: the log, with what was known of it before.
+        extraction: its columns at one clock.
+        sources: topics of every role, without those that are left out.
+        ahead: a candidate for the command that is stamped after it was recorded, and by how much [s].
+        findings: what the user reads.
+        changes: corrections as keys of the configuration, by section.
+        moves_sideways: whether the base may move to the side.
+        motion: of the body, by its poses, or of the wheels that stand in for them.
+        gyro: its reading.
+        drives: all candidates for commands and wheels that can be read.
+        command, wheels: those of them that have the roles.
+        kind: of the vehicle, if its signals show it.
+        driven: what the wheels do of the command.
+        is_scaled: whether what is commanded has a unit, so that the controller's lengths can be told from it.
+        is_still: whether the body hardly moves where the drive does.
+        in_bursts: whether the base stops before the next command, by which its gain is not known.
+        is_judged: whether a side of the wheels is dead or reversed, which explains all signs.
+        geometry: lengths by the signals.
+        alignment: corrections of the command; None where nothing shows them.
+    """
+
+    given: Given
+    extraction: Extraction
+    sources: Sources
+    ahead: tuple[DriveSource, float] | None
+    findings: list[Finding] = field(default_factory=list)
+    changes: dict[str, dict[str, object]] = field(default_factory=dict)
+    moves_sideways: bool = False
+    motion: Motion = NO_MOTION
+    gyro: Reading = field(default_factory=Reading)
+    drives: tuple[Candidate, ...] = ()
+    command: Candidate = NO_CANDIDATE
+    wheels: Candidate = NO_CANDIDATE
+    kind: str = ""
+    driven: Explained = UNEXPLAINED
+    is_scaled: bool = True
+    is_still: bool = False
+    in_bursts: bool = False
+    is_judged: bool = False
+    geometry: Geometry = field(default_factory=Geometry)
+    alignment: Alignment | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the vehicle's geometry is known."""
+        return self.given.is_known
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle as it is given."""
+        return self.given.vehicle
+
+    @property
+    def configuration(self) -> Configuration:
+        """The user's configuration."""
+        return self.given.configuration
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether a pose is recorded; else wheels stand in for it."""
+        return self.given.sources.pose is not None
+
+    def fit(self, motion: Motion) -> Case:
+        """All readings with another motion that they explain."""
+        one, other = (
+            replace(each, reading=each.reading.fitted(motion)) for each in (self.command, self.wheels)
+        )
+        return replace(
+            self,
+            motion=motion,
+            gyro=self.gyro.fitted(motion),
+            drives=tuple(replace(each, reading=each.reading.fitted(motion)) for each in self.drives),
+            command=one,
+            # Wheels that are the motion explain nothing.
+            wheels=other if self.has_pose else self.wheels,
+        )
+
+    def leave_out(self, source: DriveSource) -> Case:
         """Take a candidate for no role."""
+        sources = self.sources
         for role in ("command", "wheels"):
-            chosen = getattr(self.sources, role)
-            rest = [one for one in self.sources.rank_drives(role) if one.signals != source.signals]
+            chosen = getattr(sources, role)
+            rest = [one for one in sources.rank_drives(role) if one.signals != source.signals]
             if chosen is not None and chosen not in rest:
                 chosen = rest[0] if rest else None
-            others = {**self.sources.others, role: tuple(one for one in rest if one is not chosen)}
-            notes = tuple(note for note in self.sources.notes if source.signals[0].topic not in note)
-            self.sources = replace(self.sources, others=others, notes=notes, **{role: chosen})
+            others = {**sources.others, role: tuple(one for one in rest if one is not chosen)}
+            notes = tuple(note for note in sources.notes if source.signals[0].topic not in note)
+            sources = replace(sources, others=others, notes=notes, **{role: chosen})
+        return replace(self, sources=sources)
 
     # Signals.
 
-    def read_gyro(self) -> Reading | None:
-        """The yaw rate of the gyro; None without one."""
+    def read_gyro(self) -> Reading:
+        """The yaw rate of the gyro."""
         imu = self.extraction.imu()
         if not imu.height:
-            return None
-        return Reading("gyro", str(self.sources.imu), None, _hold(imu, "rate_z"))
+            return Reading()
+        return Reading("gyro", str(self.sources.imu), NO_SIGNAL, _hold(imu, "rate_z"))
 
     def read(
         self,
@@ -149,28 +223,42 @@ class Case:
         is_measured: bool,
         kind: str = "differential",
         section: DriveSection | None = None,
-    ) -> Reading | None:
-        """The signals of a source, with unit lengths; None if they cannot be read as the user says."""
+    ) -> Reading:
+        """The signals of a source, with unit lengths; nothing if they cannot be read as the user says."""
         section = section or self.find_section(source, is_measured=is_measured)
-        self.extraction.vehicle = unit = self.make_unit(source, kind)
+        unit = self.make_unit(source, kind)
         try:
-            table = self.extraction.read_drive(source, section, held=True)
+            table = self.extraction.read_drive(source, section, unit, held=True)
         except SlipError:
-            return None
+            return Reading()
         if source.form is DriveForm.BODY:
             names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
             signals = (_hold(table, name, may_stand=not is_measured) for name in names)
             return Reading("body", str(source), *signals)
         if unit.kind == "ackermann":
             speed = _hold(table, "speed")
-            bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
+            bent = Bent(speed, *_column(table, "steering")) if speed.moves else NO_SIGNAL
             return Reading("steering", str(source), speed, bent)
         names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
         reading = Reading("sides", str(source), *(_hold(table, name) for name in names))
         if self.moves_sideways and section.reversed is None:
             backward = msgspec.structs.replace(section, reversed="right")
-            reading.third_crossed = _hold(self.extraction.read_drive(source, backward, held=True), "sideways")
+            table = self.extraction.read_drive(source, backward, unit, held=True)
+            return replace(reading, third_crossed=_hold(table, "sideways"))
         return reading
+
+    def read_again(self, kind: str = "differential") -> Case:
+        """The case with its wheels as corrected; the same case if they cannot be read."""
+        section = self.complete().wheels
+        reading = self.read(self.wheels.source, is_measured=True, kind=kind, section=section)
+        if self.has_pose:
+            case, reading = self, reading.fitted(self.motion)
+            is_read = reading.explained.is_known
+        else:
+            motion = roll_wheels(reading)
+            is_read = motion.is_known
+            case = self.fit(motion) if is_read else self
+        return replace(case, wheels=replace(self.wheels, reading=reading)) if is_read else self
 
     def make_unit(self, source: DriveSource, kind: str) -> Vehicle:
         """A vehicle of unit lengths whose inputs are those of a source."""
@@ -198,16 +286,6 @@ class Case:
             return DriveSection()
         # A clock is one topic's.
         return msgspec.structs.replace(of_role, late_s=None)
-
-    def read_again(self, wheels: Candidate, motion: Motion, kind: str = "differential") -> bool:
-        """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""
-        section = self.complete().wheels
-        reading = self.read(wheels.source, is_measured=True, kind=kind, section=section)
-        made = None if reading is None else reading.explain(motion)
-        if reading is None or made is None or (kind == "ackermann" and not made.sign("turned")):
-            return False
-        wheels.reading = reading
-        return True
 
     # What the user reads, and what the stages read.
 
@@ -275,12 +353,27 @@ class Case:
         return 1.0 / WHEELS[str(changes.get("unit", "rad/s"))] / float(str(changes.get("scale", 1.0)))
 
 
-def _find_ahead(case: Case) -> tuple[DriveSource, float] | None:
+def open_case(given: Given) -> Case:
+    """A log of which nothing is decided yet."""
+    # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
+    equal = replace(given.sources, others={**given.sources.others, "command": ()})
+    extraction = Extraction(replace(given, sources=equal))
+    ahead = _find_ahead(given, extraction)
+    if ahead is not None:
+        equal = replace(equal, command=ahead[0])
+        section = msgspec.structs.replace(given.configuration.command, time="log")
+        by_log = msgspec.structs.replace(given.configuration, command=section)
+        extraction = Extraction(replace(given, sources=equal, configuration=by_log))
+    moves_sideways = given.may_move_sideways(given.sources)
+    return Case(given, extraction, given.sources, ahead, moves_sideways=moves_sideways)
+
+
+def _find_ahead(given: Given, extraction: Extraction) -> tuple[DriveSource, float] | None:
     """A candidate for the command that is stamped after it was recorded, and by how much [s]."""
-    late = {key: one.latency_s for key, one in case.extraction.clocks.items() if one.clock == "header"}
-    if case.configuration.command.time is not None:
+    late = {key: one.latency_s for key, one in extraction.clocks.items() if one.clock == "header"}
+    if given.configuration.command.time is not None:
         return None
-    for source in case.sources.rank_drives("command"):
+    for source in given.sources.rank_drives("command"):
         own = {signal.topic for signal in source.signals}
         rest = [latency for topic, latency in late.items() if topic not in own]
         ahead = -min((late.get(topic, 0.0) for topic in own), default=0.0)

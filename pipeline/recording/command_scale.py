@@ -11,13 +11,14 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Flags, Floats, SlipError, fit_robustly, pick, robust_spread
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.motion import FEWEST_STEPS
+from pipeline.recording.pose_choice import ONE_SCALE
 from pipeline.recording.readings import Held, Reading
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import DriveForm, Vehicle, list_presets
-from pipeline.stages import ONE_SCALE, Finding
 
 _LEAST_RATIO = 0.02
 """Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
@@ -135,9 +136,9 @@ def _compare_rates(
     Commands are lagged and delayed as the wheels follow them best.
     """
     asked, got = (_read(table, vehicle) for table in (commands, wheels))
-    motion = roll_wheels(got) if asked is not None and got is not None and got.inputs else None
+    motion = roll_wheels(got)
     nothing: Floats = np.zeros(0)
-    if asked is None or motion is None or not asked.inputs:
+    if not (motion.is_known and asked.inputs):
         return (nothing, nothing), (nothing, nothing)
     motion = motion.take(np.logical_and.reduce([one.is_there(motion.steps) for one in asked.inputs]))
     elapsed = motion.steps.end - motion.steps.start
@@ -156,10 +157,10 @@ def roll(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats]:
     return table["t"].to_numpy(), velocity
 
 
-def _read(table: pl.DataFrame, vehicle: Vehicle) -> Reading | None:
-    """The ideal motion of a drive; None without one."""
+def _read(table: pl.DataFrame, vehicle: Vehicle) -> Reading:
+    """The ideal motion of a drive."""
     if table.is_empty():
-        return None
+        return Reading()
     times, velocity = roll(table, vehicle)
     return Reading("body", "", *(Held(times, velocity[:, axis]) for axis in (0, 2)))
 
@@ -194,10 +195,10 @@ def _find_median(asked: Floats, got: Floats) -> float | None:
     return float(np.median(got[slow] / asked[slow])) if slow.sum() >= FEWEST_STEPS else None
 
 
-def _take_as_followed(case: Case, command: Candidate, alignment: Alignment) -> Alignment:
+def _take_as_followed(case: Case, alignment: Alignment) -> Alignment:
     """Scales of a body command without a unit, with which the body moves as far as it says."""
+    command = case.command
     explained = command.reading.explained
-    assert explained is not None  # noqa: S101 - asked before
     fits = (explained.ahead, explained.turned)
     scales = [abs(float(one.gains[0])) / of for one, of in zip(fits, case.command_factors(), strict=True)]
     seen = [command.sign("ahead") != 0, command.sign("turned") != 0]
@@ -207,44 +208,35 @@ def _take_as_followed(case: Case, command: Candidate, alignment: Alignment) -> A
     return replace(alignment, command_scale=ahead, command_turn_scale=turn)
 
 
-def measure_command(
-    case: Case, command: Candidate | None, wheels: Candidate | None, kind: str
-) -> Alignment | None:
-    """Corrections of the command as it is read with all others.
-
-    Args:
-        case: the log; its wheels may have explained the command.
-        command: the candidate for it.
-        wheels: the candidate for them.
-        kind: of the vehicle, if its signals show it.
-    """
-    if command is None:
-        return None
+def ask_scale(case: Case) -> Case:
+    """Corrections of the command as it is read with all others."""
+    command, wheels = case.command, case.wheels
+    if not command.is_there:
+        return case
     vehicle, made = case.vehicle, case.complete()
-    if kind and not case.is_known:
-        vehicle = msgspec.structs.replace(vehicle, kind=kind)
-    case.extraction.vehicle = vehicle
+    if case.kind and not case.is_known:
+        vehicle = msgspec.structs.replace(vehicle, kind=case.kind)
     try:
-        asked = case.extraction.read_drive(command.source, made.command, held=True)
+        asked = case.extraction.read_drive(command.source, made.command, vehicle, held=True)
         got = pl.DataFrame()
-        if wheels is not None:
-            got = case.extraction.read_drive(wheels.source, made.wheels, held=False)
+        if wheels.is_there:
+            got = case.extraction.read_drive(wheels.source, made.wheels, vehicle, held=False)
     except SlipError:
-        return None
+        return case
     is_body = command.reading.form == "body"
     alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
     # Turns of wheels over metres a second are those of their radius.
-    is_rolled = wheels is not None and wheels.source.form is DriveForm.JOINTS
+    is_rolled = wheels.source.form is DriveForm.JOINTS
     is_alike = not is_body and not (is_rolled and command.reading.form == "steering")
-    if case.driven is not None and (case.is_known or is_alike):
+    if case.driven.is_known and (case.is_known or is_alike):
         gain, made_of = None, command.reading.explained
-        if is_body and made_of is not None and command.sign("ahead") > 0:
+        if is_body and command.sign("ahead") > 0:
             gain = float(made_of.ahead.gains[0]) / case.command_factors()[0]
         late = (case.driven.lag, case.driven.delay)
         alignment, findings = measure_command_scale(
             asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
         )
-        case.findings += findings
-    if is_body and not case.is_scaled and command.reading.explained is not None:
-        alignment = _take_as_followed(case, command, alignment)
-    return alignment
+        case.findings.extend(findings)
+    if is_body and not case.is_scaled and command.reading.explained.is_known:
+        alignment = _take_as_followed(case, alignment)
+    return replace(case, alignment=alignment)

@@ -1,17 +1,17 @@
 """Encoders of the wheels: dead, backward, dying, or on another scale, each read anew as corrected."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.core import Floats
-from pipeline.recording.case import Candidate, Case, is_crossed
+from pipeline.recording.case import Case, is_crossed
+from pipeline.recording.drive import choose_sides
+from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, fit, measure_share
-from pipeline.recording.outages import leave_out
 from pipeline.recording.readings import SIDES, Held
 from pipeline.sources import DriveForm, DriveSection
-from pipeline.stages import Finding, choose_sides
 
 _FOLLOWS = 0.5
 """Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""
@@ -134,16 +134,19 @@ def snap(scale: float) -> float:
     return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
 
 
-def resolve_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
-    """Correct single wheels that contradict all others of a topic of joints; whether there are any."""
-    section, reading = case.complete().wheels, wheels.reading
+def ask_joints(case: Case) -> Case:
+    """Correct single wheels that contradict all others of a topic of joints."""
+    section, wheels, motion = case.complete().wheels, case.wheels, case.motion
+    reading = wheels.reading
     is_free = section.factors is None and section.left is None and section.right is None
+    # Of wheels that stand in for a pose each is a part of the motion.
+    is_free = is_free and case.has_pose
     if wheels.source.form is not DriveForm.JOINTS or reading.form != "sides" or not is_free:
-        return False
+        return case
     times, rates = case.extraction.read_rates(wheels.source)
     chosen = choose_sides(sorted(rates), section)
     sides = {joint: side for side, joints in chosen.items() for joint in joints}
-    late = (0.0, 0.0) if reading.explained is None else (reading.explained.lag, reading.explained.delay)
+    late = (reading.explained.lag, reading.explained.delay)
     turning = {
         joint: measure_wheel(Held(times, rates[joint]), motion, late, reading.inputs)
         for joint in sorted(sides)
@@ -163,21 +166,19 @@ def resolve_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
         line = f"{side} = [{named}]"
         about = {"joints": lost, "source": str(wheels.source)}
         case.correct("wheels", "idle joints", about, line, {side: left})
-    return bool(factors or idle)
+    return case.read_again() if factors or idle else case
 
 
-def resolve_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
-    """Correct a side whose encoder counts on another scale than the other; whether one does."""
-    reading, made = wheels.reading, wheels.reading.explained
-    first, second = reading.first, reading.second
-    is_free = case.complete().wheels.factors is None
-    if reading.form != "sides" or first is None or second is None or made is None or not is_free:
-        return False
-    late = (made.lag, made.delay)
-    left, right = (measure_wheel(one, motion, late, (first, second)) for one in (first, second))
+def ask_scales(case: Case) -> Case:
+    """Correct a side whose encoder counts on another scale than the other."""
+    reading, made = case.wheels.reading, case.wheels.reading.explained
+    if reading.form != "sides" or not made.is_known or case.complete().wheels.factors is not None:
+        return case
+    sides = (reading.first, reading.second)
+    left, right = (measure_wheel(one, case.motion, (made.lag, made.delay), sides) for one in sides)
     scale = compare_sides(left, right)
     if scale is None:
-        return False
+        return case
     counts = {"left": abs(float(left.gains[0])), "right": abs(float(right.gains[0]))}
     side, other = ("left", "right") if scale > 1.0 else ("right", "left")
     if case.is_known:
@@ -188,39 +189,35 @@ def resolve_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
     values = {"side": side, "other": other, "factor": factor}
     line = f"factors = {{{side} = {factor:g}}}"
     case.correct("wheels", "side scale", values, line, {"factors": {side: factor}})
-    return True
+    return case.read_again()
 
 
-def resolve_wheels(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> bool:
-    """Correct single encoders, the wheels read anew after each; whether signs of sides are judged."""
-    if wheels is None:
-        return _report_sides(case, motion, command, wheels)
-    if not wheels.is_measured and case.configuration.wheels != DriveSection():
-        case.read_again(wheels, motion)
-    # An encoder that dies is on no other scale before.
-    if leave_out(case, wheels, command, motion):
-        wheels.reading.explained = None
-        case.read_again(wheels, motion)
-    if resolve_joints(case, wheels, motion):
-        case.read_again(wheels, motion)
-    is_judged = _report_sides(case, motion, command, wheels)
+def read_as_wheels(case: Case) -> Case:
+    """Wheels that were read as a candidate for the command, by what the user says of wheels."""
+    is_said = case.wheels.is_there and case.configuration.wheels != DriveSection()
+    return case.read_again() if is_said and not case.wheels.is_measured else case
+
+
+def ask_sides(case: Case) -> Case:
+    """A side that is dead or counts backward."""
+    is_judged = _report_sides(case)
     if "reversed" in case.changes.get("wheels", {}):
         # What is wrong beside a side that is corrected shows now.
-        is_judged = not case.read_again(wheels, motion)
-    if resolve_scales(case, wheels, motion):
-        case.read_again(wheels, motion)
-    return is_judged
+        again = case.read_again()
+        return replace(again, is_judged=again is case)
+    return replace(case, is_judged=is_judged)
 
 
-def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels: Candidate | None) -> bool:
-    """A side that is dead or counts backward; whether one was found."""
-    if wheels is not None and wheels.reading.form == "sides" and report_dead(case, wheels):
+def _report_sides(case: Case) -> bool:
+    """Whether a side is dead or counts backward, which is told or corrected."""
+    command, wheels = case.command, case.wheels
+    if wheels.reading.form == "sides" and _report_dead(case):
         return True
-    of_wheels = wheels is not None and wheels.is_sure and is_crossed(wheels)
-    of_command = command is not None and command.is_sure and is_crossed(command)
-    if of_wheels and wheels is not None and wheels.reading.explained is not None and not of_command:
+    of_wheels = wheels.is_sure and is_crossed(wheels)
+    of_command = case.has_pose and command.is_sure and is_crossed(command)
+    if of_wheels and not of_command:
         # Of a heading that was turned the command tells which way is ahead.
-        is_behind = bool(motion.offset_deg) and command is not None and command.sign("ahead") < 0
+        is_behind = bool(case.motion.offset_deg) and command.sign("ahead") < 0
         is_right = (wheels.reading.explained.ahead.gains[0] > 0.0) != is_behind
         side = "right" if is_right else "left"
         margin = wheels.reading.explained.sign_margin
@@ -233,7 +230,7 @@ def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels:
             margin,
         )
         return True
-    if of_command and command is not None and command.reading.explained is not None:
+    if of_command:
         explained = command.reading.explained
         # A body command reaches the right side as speed plus turn.
         is_right = (
@@ -242,24 +239,19 @@ def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels:
             else explained.ahead.gains[0] > 0
         )
         side = "right" if is_right else "left"
-        also = "encoder too" if of_wheels else "encoder right" if wheels is not None else "no encoder"
+        also = "encoder too" if of_wheels else "encoder right" if wheels.is_there else "no encoder"
         values = {"value": explained.sign_margin, "side": side, "kind": also}
         case.findings.append(Finding("motor_reversed", "error", "command", values))
         return True
     return False
 
 
-def report_dead(case: Case, wheels: Candidate, *, has_pose: bool = True) -> bool:
-    """A side whose encoder is dead; whether one is.
-
-    Args:
-        case: the log.
-        wheels: their candidate, a speed a side.
-        has_pose: whether the log holds a pose, so that it can be analyzed from commands.
-    """
-    dead = wheels.reading.dead_side
+def _report_dead(case: Case) -> bool:
+    """Whether the encoder of a side is dead, which is told."""
+    dead = case.wheels.reading.dead_side
     if not dead:
         return False
-    values = {"side": dead, "other": next(side for side in SIDES if side != dead), "has_pose": has_pose}
+    other = next(side for side in SIDES if side != dead)
+    values = {"side": dead, "other": other, "has_pose": case.has_pose}
     case.findings.append(Finding("wheel_dead", "error", f"wheels {dead}", values))
     return True

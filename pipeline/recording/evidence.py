@@ -44,13 +44,11 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
         stays; and the angle [degrees] of another frame along which the reading is followed, where it is not
         along this one.
     """
-    fitted = [one for one in readings if one.form != "gyro" and one.explained is not None]
-    known = [one for one in fitted if one.explained is not None and one.explained.is_sure]
+    known = [one for one in readings if one.form != "gyro" and one.explained.is_sure]
     if not known:
         return motion, 0.0, None
-    best = max(known, key=lambda one: one.explained.moves if one.explained else 0.0)
+    best = max(known, key=lambda one: one.explained.moves)
     explained = best.explained
-    assert explained is not None  # noqa: S101 - chosen for it
     part = explained.motion
     ahead, _ = best.columns(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
     aside = best.columns_aside(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
@@ -452,7 +450,7 @@ _EQUAL = 0.02
 def equal_motion(one: Reading) -> tuple[bool, bool]:
     """Whether the numbers of a body's motion equal what it does, at once: ahead, and turning."""
     made = one.explained
-    if made is None or one.form != "body" or not made.is_sure or made.lag + made.delay >= _LEAD_S:
+    if one.form != "body" or not made.is_sure or made.lag + made.delay >= _LEAD_S:
         return False, False
     ahead, turned = (abs(float(each.gains[0]) - 1.0) < _EQUAL for each in (made.ahead, made.turned))
     return ahead, turned
@@ -469,7 +467,6 @@ def rate_command(one: Reading, rank: int, earliest: float) -> float:
         earliest: least delay of all readings [s].
     """
     explained = one.explained
-    assert explained is not None  # noqa: S101 - given so
     named = _USUAL * bool(COMMANDED.search(one.name.lower())) - _USUAL * is_named_measured(one.name)
     late = explained.lag + explained.delay
     lead = float(np.clip((late - earliest) / _LEAD_S, 0.0, 4.0))

@@ -14,8 +14,8 @@ from pipeline.logs import (
     read_topics,
     take_start,
 )
+from pipeline.recording.findings import Finding
 from pipeline.sources import Recognized, Vehicle, find_preset, plain_type, recognize_vehicle
-from pipeline.stages import Finding
 
 _LOST_ENDS = ("truncated", "damaged_summary")
 """Losses of the end of a file, where recorders write what they say of the recording."""

@@ -5,17 +5,15 @@ a guess: its interval is by how it differs between blocks of the drive, not by t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 
 from pipeline.core import NORMAL_95, join_parts
-from pipeline.recording.case import Candidate, Case, is_crossed
-from pipeline.recording.evidence import RIMS
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, STEP_S, Fit, Motion, Steps
-from pipeline.recording.readings import SIDES, Explained, Reading
-from pipeline.sources import RANGES, DriveForm, find_alike_vehicles
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Fit, Motion, Steps
+from pipeline.recording.readings import SIDES, UNEXPLAINED, Explained, Reading
+from pipeline.sources import RANGES, find_alike_vehicles
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _SAME_TRACK = 0.1
@@ -117,22 +115,24 @@ class Geometry:
         }
 
 
-def roll_wheels(wheels: Reading) -> Motion | None:
-    """Increments of wheels that roll without slip, in their own units; None if they hardly turn."""
+def roll_wheels(wheels: Reading) -> Motion:
+    """Increments of wheels that roll without slip, in their own units; `NO_MOTION` if they hardly turn."""
+    if not wheels.inputs:
+        return NO_MOTION
     start = max(float(one.times[0]) for one in wheels.inputs)
     end = min(float(one.times[-1]) for one in wheels.inputs)
     if end - start < FEWEST_STEPS * STEP_S:
-        return None
+        return NO_MOTION
     edges = np.arange(start, end, STEP_S)
     steps = Steps(edges[:-1], edges[1:])
     steps = steps.take(np.logical_and.reduce([one.is_there(steps) for one in wheels.inputs]))
     if steps.start.size < FEWEST_STEPS:
-        return None
+        return NO_MOTION
     ahead, turned = wheels.columns(steps, 0.0, 0.0, crossed=False)
     return Motion(steps, join_parts(ahead, 0.0), np.zeros(turned.size), turned, "z")
 
 
-def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
+def explain_wheels(command: Reading, wheels: Reading) -> Explained:
     """What wheels do of a command: their motion takes the place of a pose's.
 
     Args:
@@ -140,14 +140,13 @@ def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
         wheels: what is measured of them.
 
     Returns:
-        The fit; None if the wheels do not follow the command, or one of its sides counts backward.
+        The fit; `UNEXPLAINED` if the wheels do not follow the command, or one of its sides counts backward.
     """
     is_whole = len(wheels.inputs) == len(SIDES) or (wheels.inputs and wheels.form != "sides")
-    motion = roll_wheels(wheels) if is_whole else None
-    if motion is None:
-        return None
-    made = Reading(command.form, command.name, command.first, command.second).explain(motion)
-    return None if made is None or not made.is_sure or made.crossed else made
+    if not is_whole:
+        return UNEXPLAINED
+    made = Reading(command.form, command.name, command.first, command.second).explain(roll_wheels(wheels))
+    return UNEXPLAINED if not made.is_sure or made.crossed else made
 
 
 def measure_controller(made: Explained) -> tuple[Length | None, Length | None]:
@@ -291,38 +290,3 @@ def _list_shown(
         one, other = shown["track_width_m"], shown.pop("wheelbase_m")
         shown["track_width_m"] = Length(one.value + other.value, one.error + other.error)
     return words, shown
-
-
-def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | None) -> Geometry:
-    """Lengths of the vehicle by its controller and by the motion."""
-    made = Geometry()
-    car = next((one for one in (wheels, command) if one is not None and one.reading.form == "steering"), None)
-    if car is not None and car.reading.explained is not None and car.sign("turned"):
-        is_turned = car is wheels and car.source.form is DriveForm.JOINTS
-        return measure_car(car.reading.explained, is_measured=is_turned)
-    if wheels is None or wheels.reading.form != "sides":
-        sides = command if command is not None and command.reading.form == "sides" else None
-    else:
-        sides = wheels
-    is_driven = (
-        command is not None
-        and wheels is not None
-        and wheels.reading.form == "sides"
-        and command.reading.form == "body"
-        and case.is_scaled
-    )
-    if is_driven and case.driven is not None:
-        radius, track = measure_controller(case.driven)
-        speed, rate = case.command_factors()
-        radius = None if case.in_bursts else _scale(radius, speed * case.wheel_factor())
-        made = Geometry(radius=radius, track=_scale(track, speed / rate))
-    if sides is not None and sides.is_sure and not is_crossed(sides) and sides.reading.explained is not None:
-        factor = case.wheel_factor("wheels" if sides is wheels else "command")
-        rolled, effective = measure_geometry(sides.reading.explained, factor, made.radius)
-        made = replace(made, rolled=rolled, effective=effective)
-    changes = case.changes.get("command" if sides is command else "wheels", {})
-    return replace(made, is_taken="scale" in changes or changes.get("unit") in RIMS)
-
-
-def _scale(length: Length | None, factor: float) -> Length | None:
-    return None if length is None else Length(length.value * factor, length.error * factor)

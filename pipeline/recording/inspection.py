@@ -9,6 +9,8 @@ import numpy as np
 from pipeline.core import PAUSE_NS, Flags, Floats, Ints, SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
 from pipeline.recording import LogOptions
+from pipeline.recording.clocks import find_pauses
+from pipeline.recording.findings import Finding
 from pipeline.recording.log_choice import Choice, choose, make_stand_in
 from pipeline.recording.log_setup import report_unused, require_messages, require_sources
 from pipeline.sources import (
@@ -19,7 +21,6 @@ from pipeline.sources import (
     choose_sources,
     load_configuration,
 )
-from pipeline.stages import Finding, find_pauses
 
 _GAP_PERIODS = 3.0
 

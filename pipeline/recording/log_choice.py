@@ -21,7 +21,6 @@ import msgspec
 from pipeline.core import NORMAL_95, return_freed_memory
 from pipeline.logs import (
     ChannelInfo,
-    LogData,
     LogError,
     LogIndex,
     Ragged,
@@ -33,7 +32,11 @@ from pipeline.logs import (
     read_topics,
     wanted_transforms,
 )
+from pipeline.recording.extract import Given
+from pipeline.recording.findings import Finding, Severity
 from pipeline.recording.folder import find_in_folder
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.topic_values import find_sideways_share, list_wanted, with_texts
 from pipeline.sources import (
     CONFIGURED,
     UNKNOWN_VEHICLE,
@@ -64,13 +67,12 @@ from pipeline.sources import (
     recognize_vehicle,
     resolve_vehicle,
 )
-from pipeline.stages import Finding, Given, Severity, find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
     from pipeline.recording import Recording
     from pipeline.recording.geometry import Geometry
-    from pipeline.stages import PoseRating
+    from pipeline.recording.pose_choice import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
 _LISTS = ("new_parameters", "changed_parameters")
@@ -155,7 +157,7 @@ class Choice:
         sources: topics of every role.
         ratings: candidates for the pose, the best first; empty if nothing was compared.
         findings: findings on the choice.
-        data: data read for the choice; None if names were sufficient.
+        log: columns that were read for the choice; None where nothing was to be compared.
         recording: what the signals show; None without a pose.
     """
 
@@ -164,8 +166,13 @@ class Choice:
     sources: Sources
     ratings: tuple[PoseRating, ...] = ()
     findings: tuple[Finding, ...] = ()
-    data: LogData | None = None
+    log: LogColumns | None = None
     recording: Recording | None = None
+
+    def take_log(self) -> LogColumns:
+        """The columns of a log that can be analyzed, which were read to choose its pose."""
+        assert self.log is not None  # noqa: S101 - without a pose the log is refused
+        return self.log
 
     def list_fitted(self) -> list[str]:
         """Lines of the section [vehicle] of run.toml for what was fitted; none where no length was."""
@@ -323,16 +330,20 @@ def _choose_pose(
 ) -> Choice:
     """The choice with the pose by its content, or with wheels that stand in for it."""
     sources = chosen.sources
-    if sources.pose is None:
-        if _lacks_pose(channels, configuration, chosen.vehicle, sources, str(index.path)):
-            return _let_wheels_stand_in(chosen, index, configuration)
+    if sources.pose is None and not _lacks_pose(
+        channels, configuration, chosen.vehicle, sources, str(index.path)
+    ):
         return chosen
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
     if len(rivals) >= MOST_POSES:
         rivals, finding = _leave_out_poses(index, rivals)
         sources = replace(sources, others={**sources.others, "pose": tuple(rivals)})
         chosen = replace(chosen, sources=sources, findings=(*chosen.findings, finding))
-    return _compare(chosen, index, configuration, rivals)
+    drives = [*sources.rank_drives("command"), *sources.rank_drives("wheels")]
+    log = LogColumns(read_topics(index, list_wanted(sources, index.types, [*rivals, *drives])))
+    return_freed_memory()
+    given = Given(log, sources, configuration, chosen.vehicle, where=str(index.path))
+    return _let_wheels_stand_in(chosen, given) if sources.pose is None else _compare(chosen, given)
 
 
 def _lacks_pose(
@@ -352,22 +363,18 @@ def _lacks_pose(
     return choose_sources(announced, configuration, vehicle, where=where).pose is None
 
 
-def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configuration) -> Choice:
-    """The choice for a log without poses, see `examine_drive`; unchanged if its wheels cannot be read."""
-    from pipeline.recording import examine_drive  # noqa: PLC0415 - heavy
+def _let_wheels_stand_in(chosen: Choice, given: Given) -> Choice:
+    """The choice for a log without poses; unchanged if its wheels cannot stand in for one."""
+    from pipeline.recording import examine  # noqa: PLC0415 - heavy
 
-    drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
-    data = read_topics(index, list_wanted(chosen.sources, index.types, drives))
-    recording = examine_drive(
-        Given(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
-    )
-    if recording is None:
+    recording = examine(given)
+    if recording.sources.pose is None:
         return chosen
     return replace(
         chosen,
         sources=recording.sources,
         findings=(*chosen.findings, *recording.findings),
-        data=data,
+        log=given.log,
         recording=recording,
     )
 
@@ -520,19 +527,13 @@ def _list_contradictions(
             yield Finding("vehicle_contradiction", "warning", "vehicle", values)
 
 
-def _compare(
-    chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
-) -> Choice:
+def _compare(chosen: Choice, given: Given) -> Choice:
     """Choose among the poses by their content, then the other roles by the motion of the pose."""
     from pipeline.recording import examine  # noqa: PLC0415 - heavy
-    from pipeline.stages import rate_poses, replace_pose  # noqa: PLC0415 - heavy
+    from pipeline.recording.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
-    drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
-    data = read_topics(index, list_wanted(chosen.sources, index.types, [*rivals, *drives]))
-    return_freed_memory()
     sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
-    given = Given(data, sources, configuration, chosen.vehicle, where=str(index.path))
-    if rivals or _may_be_odometry(sources.pose):
+    if sources.others.get("pose") or _may_be_odometry(sources.pose):
         ratings = rate_poses(given)
         if ratings and ratings[0].same_as:
             values = {
@@ -549,9 +550,8 @@ def _compare(
             )
         sources = replace_pose(sources, ratings)
         if useless:
-            alone = _let_wheels_stand_in(
-                replace(chosen, sources=replace(sources, pose=None)), index, configuration
-            )
+            bare = replace(sources, pose=None)
+            alone = _let_wheels_stand_in(replace(chosen, sources=bare), replace(given, sources=bare))
             if alone.recording is not None:
                 what = f"the poses of {ratings[0].source}: {useless}"
                 unused = Finding("numbers_not_used", "warning", ratings[0].source.topic, {"what": what})
@@ -574,7 +574,7 @@ def _compare(
         sources=recording.sources,
         ratings=ratings,
         findings=(*findings, *recording.findings),
-        data=data,
+        log=given.log,
         recording=recording,
     )
 
@@ -612,14 +612,15 @@ def _fit_vehicle(
     from pipeline.recording.geometry import LENGTHS, describe_vehicle  # noqa: PLC0415 - heavy
 
     recording, sources = chosen.recording, chosen.sources
-    if recording is None or chosen.data is None:
+    if recording is None or chosen.log is None:
         raise problem
+    topics = chosen.log.data.topics
     given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
     kind = str(given.get("kind") or recording.kind or chosen.vehicle.kind)
-    if "kind" not in given and kind != "mecanum" and find_sideways_share(chosen.data.topics, sources.command):
+    if "kind" not in given and kind != "mecanum" and find_sideways_share(topics, sources.command):
         # The arrangement of the wheels is unknown: only body motion can be evaluated.
         kind = "omni"
-    known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
+    known = {**read_frames(TransformBuffer(topics))[1], **recorded, **given}
     lengths = recording.geometry.list_lengths(kind)
     fitted = {key: length.value for key, length in lengths.items()}
     errors = {key: float(length.error) for key, length in lengths.items() if key not in known}

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
 from pipeline.recording import LogOptions, RecordingError
+from pipeline.recording.findings import Finding, Severity, blame_damage
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.recording.readings import SIDES
 from pipeline.recording.units import JOYSTICK
@@ -29,7 +30,6 @@ from pipeline.sources import (
     load_configuration,
     plain_type,
 )
-from pipeline.stages import Finding, Severity, blame_damage
 
 UNKNOWN = "unknown"
 

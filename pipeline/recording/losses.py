@@ -4,14 +4,17 @@ Whether the base lost them, too, its motion tells: it obeyed what is between the
 last one that is recorded.
 """
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 
 from pipeline.core import NORMAL_95, Floats
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
+from pipeline.recording.lost_messages import number_gaps
 from pipeline.recording.motion import compare
 from pipeline.recording.readings import Reading
-from pipeline.stages import Finding, number_gaps
 
 _LEAST = 0.05
 """Least share of the messages that is worth a word: by one in twenty a command at 10 Hz is 5 ms old."""
@@ -24,46 +27,42 @@ _FEWEST_GAPS = 10
 deviations below."""
 
 
-def resolve_losses(case: Case, command: Candidate | None) -> None:
+def ask_losses(case: Case) -> Case:
     """Tell which share of the commands is lost, and take those between the others that the base obeyed.
 
     Beforehand it is as likely that the base lost them as that it did not: the motion decides at 95 %.
-
-    Args:
-        case: the log.
-        command: the candidate for the command, whose reading is replaced.
     """
-    if command is None or len({signal.topic for signal in command.source.signals}) > 1:
-        return
+    command = case.command
+    if len({signal.topic for signal in command.source.signals}) > 1:
+        return case
     reading, section = command.reading, case.complete().command
     share, period = find_losses(reading)
     made = reading.explained
-    if not share or made is None:
-        return
+    if not share or not made.is_known:
+        return case
     values: dict[str, object] = {
         "kind": "told",
         "value": share,
         "source": str(command.source),
         "period_s": period,
     }
-    filled = None
+    filled = Reading()
     if not section.interpolate and section.hold_s is None:
         between = msgspec.structs.replace(section, interpolate=True)
-        filled = case.read(command.source, is_measured=False, section=between)
-    tried = None if filled is None else filled.explain(made.motion)
+        filled = case.read(command.source, is_measured=False, section=between).fitted(made.motion)
     gain = 0.0
-    if tried is not None and tried.blocks.size == made.blocks.size:
-        gain = compare(tried.blocks, made.blocks)
-    if filled is not None and gain > NORMAL_95:
+    if filled.explained.blocks.size == made.blocks.size:
+        gain = compare(filled.explained.blocks, made.blocks)
+    if gain > NORMAL_95:
         case.changes.setdefault("command", {})["interpolate"] = True
-        command.reading = filled
-        filled.explain(made.motion)
+        command = replace(command, reading=filled)
         values["kind"] = "interpolated"
     elif gain < -NORMAL_95:
         values["kind"] = "held"
     elif not section.interpolate:
         values["kind"] = "undecided"
     case.findings.append(Finding("commands_lost", "warning", "command", values))
+    return replace(case, command=command)
 
 
 def find_losses(reading: Reading) -> tuple[float, float]:

@@ -230,6 +230,11 @@ class Motion:
     offset_deg: float = 0.0
 
     @property
+    def is_known(self) -> bool:
+        """Whether there is any."""
+        return self.moved.size > 0
+
+    @property
     def body(self) -> Complex:
         """Displacements in the vehicle's frame [m]: ahead + 1j * left."""
         sense = -1.0 if self.flip else 1.0
@@ -276,20 +281,25 @@ class Motion:
         return float(np.degrees(0.5 * np.angle(moment))), float(abs(moment)) / max(power, 1e-12)
 
 
-def measure_motion(poses: pl.DataFrame) -> Motion | None:
+_NOTHING: Floats = np.zeros(0)
+NO_MOTION = Motion(Steps(_NOTHING, _NOTHING), np.zeros(0, dtype=np.complex128), _NOTHING, _NOTHING, "z")
+"""A motion of which too little is recorded."""
+
+
+def measure_motion(poses: pl.DataFrame) -> Motion:
     """Increments of the poses over steps of a tenth of a second or of their period.
 
     Args:
         poses: table `poses` as extracted.
 
     Returns:
-        The motion; None with fewer than thirty steps.
+        The motion; `NO_MOTION` with fewer than thirty steps.
     """
     fresh = poses.filter(
         ~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite() & pl.col("active")
     )
     if fresh.height <= FEWEST_STEPS:
-        return None
+        return NO_MOTION
     time = fresh["t"].to_numpy()
     position = fresh.select("x", "y", "z").to_numpy()
     quaternion = fresh.select("q_x", "q_y", "q_z", "q_w").to_numpy()
@@ -297,7 +307,7 @@ def measure_motion(poses: pl.DataFrame) -> Motion | None:
     length = max(STEP_S, period)
     rows = _choose_rows(time, 0.95 * length)
     if len(rows) <= FEWEST_STEPS:
-        return None
+        return NO_MOTION
     time, position, quaternion = time[rows], position[rows], quaternion[rows]
     segment = fresh["segment"].to_numpy()[rows]
     axis, up, yaw = _find_plane(position, quaternion)
@@ -307,12 +317,12 @@ def measure_motion(poses: pl.DataFrame) -> Motion | None:
     elapsed, moved, turned = np.diff(time), np.diff(plane), np.diff(yaw)
     whole = (elapsed > 0.3 * length) & (elapsed < 3.0 * length) & (np.diff(segment) == 0)
     if whole.sum() < FEWEST_STEPS:
-        return None
+        return NO_MOTION
     speed = np.abs(moved) / np.maximum(elapsed, 1e-3)
     fastest = 20.0 * max(float(np.quantile(speed[whole], 0.9)), 0.02)
     sane = whole & (speed < fastest) & (np.abs(turned) < 12.0 * elapsed)
     if sane.sum() < FEWEST_STEPS:
-        return None
+        return NO_MOTION
     middle = yaw[:-1] + 0.5 * turned
     return Motion(
         Steps(time[:-1][sane], time[1:][sane]),

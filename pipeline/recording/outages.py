@@ -7,18 +7,19 @@ moves as commanded, so that only the encoder can be wrong.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import Flags, Floats, Ints, find_scale, fit_robustly, list_likelihoods
-from pipeline.recording.case import Candidate, Case
-from pipeline.recording.motion import STEP_S, Motion, Steps
-from pipeline.recording.readings import SIDES, Held, Reading
+from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
+from pipeline.recording.hypotheses import BLOCK_S, follow_likeliest, price_change
+from pipeline.recording.motion import NO_MOTION, STEP_S, Motion, Steps
+from pipeline.recording.readings import NO_SIGNAL, SIDES, UNEXPLAINED, Held, Reading
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import OutageSection
-from pipeline.stages import BLOCK_S, Finding, follow_likeliest, price_change
 
 _LEAST = 0.03
 """Fraction of the usual largest speed of a side below which a difference is no contradiction."""
@@ -121,18 +122,18 @@ def _fit(columns: Floats, values: Floats, rows: Flags, least: float) -> _Follows
 def find_outages(
     sides: Mapping[str, Held],
     late: tuple[float, float],
-    command: Reading | None,
-    motion: Motion | None,
+    command: Reading,
+    motion: Motion,
 ) -> list[Outage]:
     """Spans in which a side's encoder reads nothing.
 
     Args:
         sides: readings by name.
         late: lag and delay of the motion after the wheels [s].
-        command: fitted to the motion; None without one that is followed.
-        motion: of the poses; None where no pose is recorded.
+        command: fitted to the motion; nothing without one that is followed.
+        motion: of the poses; `NO_MOTION` where no pose is recorded.
     """
-    if motion is not None:
+    if motion.is_known:
         steps = motion.steps
     else:
         ends = [one.times[[0, -1]] for one in sides.values()]
@@ -142,10 +143,10 @@ def find_outages(
     if blocks.elapsed.size < _FEWEST_BLOCKS:
         return []
     moved = asked = None
-    if motion is not None:
+    if motion.is_known:
         moved = np.column_stack([blocks.average(one) for one in (motion.body.real, motion.yaw)])
     known = np.ones(blocks.elapsed.size, dtype=bool)
-    if command is not None and command.explained is not None:
+    if command.explained.is_known:
         made = command.explained
         known = blocks.hold_all(np.logical_and.reduce([one.is_there(steps) for one in command.inputs]))
         columns = command.columns(steps, made.lag, made.delay, crossed=False)
@@ -385,25 +386,35 @@ def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: 
     return made
 
 
-def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: Motion | None) -> bool:
-    """Leave out where an encoder reads nothing while all else goes on; whether any is left out."""
+def ask_outages(case: Case) -> Case:
+    """Leave out where an encoder reads nothing while all else goes on."""
+    wheels = case.wheels
     reading, section = wheels.reading, case.complete().wheels
     if section.ignore is not None or reading.dead_side or not reading.inputs:
-        return False
+        return case
     names = SIDES if reading.form == "sides" else ("both",)
-    sides = {name: one for name, one in zip(names, (reading.first, reading.second), strict=False) if one}
-    made = reading.explained
-    late = (0.0, 0.0) if made is None else (made.lag, made.delay)
-    asked = command.reading if command is not None and command.is_sure else None
-    outages = find_outages(sides, late, asked, motion)
+    sides = {
+        name: one
+        for name, one in zip(names, (reading.first, reading.second), strict=False)
+        if one is not NO_SIGNAL
+    }
+    late = (reading.explained.lag, reading.explained.delay)
+    asked = case.command.reading if case.command.is_sure else Reading()
+    poses = case.motion if case.has_pose else NO_MOTION
+    outages = find_outages(sides, late, asked, poses)
     if not outages:
-        return False
+        return case
     kind = "ackermann" if reading.form == "steering" else "differential"
-    case.extraction.vehicle = case.make_unit(wheels.source, kind)
-    table = case.extraction.read_drive(wheels.source, section, held=False)
+    table = case.extraction.read_drive(
+        wheels.source, section, case.make_unit(wheels.source, kind), held=False
+    )
     stamps = table["t"].to_numpy()
     clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
-    there = {"command": asked, "pose": motion, "other wheels": asked is None or motion is None}
+    there = {
+        "command": asked.inputs,
+        "pose": poses.is_known,
+        "other wheels": not (asked.inputs and poses.is_known),
+    }
     witnesses = [name for name, is_there in there.items() if is_there]
     stretches, spans = list[dict[str, object]](), []
     for one in outages:
@@ -431,7 +442,11 @@ def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: 
     }
     begin = None if np.isinf(outages[0].start) else outages[0].start
     case.findings.append(Finding("encoder_dead", "warning", "wheels", values, t_start=begin))
-    return True
+    # What it was fitted by is wrong.
+    unread = replace(wheels, reading=replace(reading, explained=UNEXPLAINED))
+    return replace(case, wheels=unread).read_again(
+        "ackermann" if reading.form == "steering" else "differential"
+    )
 
 
 def write_spans(spans: Sequence[OutageSection]) -> str:

@@ -3,17 +3,18 @@
 Which of them a drive obeys depends on when it reads, so that nothing is concluded from what they ask for.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from pipeline.core import Floats
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import NO_CANDIDATE, Case
+from pipeline.recording.findings import Finding
 from pipeline.recording.outages import write_spans
 from pipeline.recording.readings import Reading
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import OutageSection
-from pipeline.stages import Finding
 
 _RETURNS = 0.1
 """Largest difference of two commands of one publisher, as a fraction of that to the other's between them."""
@@ -33,20 +34,21 @@ _MOST = 0.5
 """Share of the driving from which on the turns are no exception, and the command is of no use."""
 
 
-def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate | None) -> Candidate | None:
-    """Leave out where two publishers command by turns; the command, or nothing if that is nearly all."""
-    if command is None or case.complete().command.ignore is not None:
-        return command
+def ask_publishers(case: Case) -> Case:
+    """Leave out where two publishers command by turns, or the command if that is nearly all."""
+    command, wheels = case.command, case.wheels
+    if case.complete().command.ignore is not None:
+        return case
     reading = command.reading
     times, asked = _read_commands(reading)
     spans = find_turns(times, asked)
     if not spans:
-        return command
+        return case
     live = np.linalg.norm(asked, axis=1) > 0.0
     inside = np.logical_or.reduce([(times >= start) & (times <= end) for start, end in spans])
     zeros = float(np.mean(~live[inside]))
-    case.extraction.vehicle = case.make_unit(command.source, "differential")
-    table = case.extraction.read_drive(command.source, case.complete().command, held=True)
+    unit = case.make_unit(command.source, "differential")
+    table = case.extraction.read_drive(command.source, case.complete().command, unit, held=True)
     clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
     ends = [np.interp(span, table["t"].to_numpy(), clock).tolist() for span in spans]
     values: dict[str, object] = {
@@ -58,7 +60,7 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
         "end_s": ends[0][1],
     }
     is_rest_used = bool(np.mean(inside[live]) < _MOST)
-    is_replaced = not is_rest_used and wheels is not None and wheels.is_sure
+    is_replaced = not is_rest_used and wheels.is_sure
     if is_rest_used:
         ignore = [
             OutageSection(start_s=float(np.floor(1e2 * start) / 1e2), end_s=float(np.ceil(1e2 * end) / 1e2))
@@ -73,14 +75,11 @@ def resolve_publishers(case: Case, command: Candidate | None, wheels: Candidate 
     severity: Literal["warning", "error"] = "warning" if is_usable else "error"
     case.findings.append(Finding(name, severity, "command", values))
     if is_replaced:
-        case.leave_out(command.source)
-        return None
-    if is_rest_used:
-        read = case.read(command.source, is_measured=False, section=case.complete().command)
-        if read is not None and reading.explained is not None:
-            read.explain(reading.explained.motion)
-            command.reading = read
-    return command
+        return replace(case.leave_out(command.source), command=NO_CANDIDATE)
+    read = case.read(command.source, is_measured=False, section=case.complete().command)
+    if not (is_rest_used and read.form and reading.explained.is_known):
+        return case
+    return replace(case, command=replace(command, reading=read.fitted(reading.explained.motion)))
 
 
 def _read_commands(reading: Reading) -> tuple[Floats, Floats]:

@@ -17,6 +17,7 @@ from pipeline.recording.motion import (
     CLEAR,
     FEWEST_STEPS,
     LEAST_NATS,
+    NO_MOTION,
     Fit,
     Motion,
     Steps,
@@ -116,6 +117,10 @@ class Held:
         )
 
 
+NO_SIGNAL = Held(np.zeros(0), np.zeros(0))
+"""A signal that is not recorded."""
+
+
 def follow(values: Floats, lag: float) -> Floats:
     """First-order lag on the grid, without the delay of half a cell that a filter of held values has."""
     if lag <= 0.0:
@@ -167,7 +172,7 @@ class Bent(Held):
         return np.asarray(super().is_there(steps) & self._angle.is_there(steps))
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Explained:
     """A motion explained by a reading.
 
@@ -194,6 +199,11 @@ class Explained:
     shares: tuple[float, float] = (0.0, 0.0)
     aside: tuple[Fit, Floats] | None = None
     across: tuple[Fit, Floats] | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough of the reading is recorded beside the motion."""
+        return self.motion.is_known
 
     @property
     def blocks(self) -> Floats:
@@ -241,35 +251,50 @@ class Explained:
         return int(np.sign(one.gains[0]))
 
 
+_NO_FIT = Fit(np.zeros(1), np.zeros(1), np.zeros(0), np.zeros(0))
+UNEXPLAINED = Explained(
+    NO_MOTION,
+    crossed=False,
+    lag=0.0,
+    delay=0.0,
+    ahead=_NO_FIT,
+    turned=_NO_FIT,
+    none=(_NO_FIT.blocks, _NO_FIT.blocks),
+    other=None,
+)
+"""A motion beside which too little of a reading is recorded: nothing is known of either."""
+
+
 _AS_IT_IS = 0.5
 """Least share of both channels that signals explain as they are: near zero where a side is reversed."""
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Reading:
-    """Two inputs that may explain a motion.
+    """Two inputs that may explain a motion; one without inputs is that of signals that do not exist.
 
     Attributes:
         form: ``body`` (speed, yaw rate), ``sides`` (left, right), ``steering`` (speed, speed times the
-            tangent of the angle) or ``gyro`` (nothing, yaw rate).
+            tangent of the angle) or ``gyro`` (nothing, yaw rate); empty of nothing.
         name: for people.
         first, second: the inputs.
         third: of a base that moves sideways, what moves it to the left, in the unit of the first.
         third_crossed: the same if the wheels of the right side count backward.
+        explained: the motion that it was fitted to, see `fitted`.
     """
 
-    form: str
-    name: str
-    first: Held | None
-    second: Held | None
-    third: Held | None = None
-    third_crossed: Held | None = None
-    explained: Explained | None = field(default=None, init=False)
+    form: str = ""
+    name: str = ""
+    first: Held = NO_SIGNAL
+    second: Held = NO_SIGNAL
+    third: Held = NO_SIGNAL
+    third_crossed: Held = NO_SIGNAL
+    explained: Explained = field(default=UNEXPLAINED, kw_only=True)
 
     @property
     def inputs(self) -> Sequence[Held]:
         """Inputs that move."""
-        return [one for one in (self.first, self.second, self.third) if one is not None and one.moves]
+        return [one for one in (self.first, self.second, self.third) if one.moves]
 
     @property
     def is_constant(self) -> bool:
@@ -289,7 +314,7 @@ class Reading:
         """Increments ahead and of the heading, in the reading's own units; see `Held.integrate`."""
         one, two = (
             each.integrate(steps, lag, delay)
-            if each is not None and each.moves
+            if each.moves
             else np.zeros(np.broadcast_shapes(np.shape(delay), steps.start.shape))
             for each in (self.first, self.second)
         )
@@ -300,25 +325,28 @@ class Reading:
     def columns_aside(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> Floats:
         """Increments to the left, in the reading's own units; none, or one, of shape (n, 1)."""
         aside = self.third_crossed if crossed else self.third
-        if aside is None or not aside.moves:
+        if not aside.moves:
             return np.zeros((steps.start.size, 0))
         return aside.integrate(steps, lag, delay)[:, None]
 
-    def explain(self, whole: Motion) -> Explained | None:
-        """Fit the motion; also kept as ``explained``."""
-        self.explained = None
-        if not self.inputs:
-            return None
+    def fitted(self, whole: Motion) -> Reading:
+        """The reading with a motion that it explains."""
+        return replace(self, explained=self.explain(whole))
+
+    def explain(self, whole: Motion) -> Explained:
+        """Fit the motion; `UNEXPLAINED` where too little is recorded."""
+        if not (whole.is_known and self.inputs):
+            return UNEXPLAINED
         keep = np.logical_and.reduce([one.is_there(whole.steps) for one in self.inputs])
         busy = self._find_busy(whole)
         if (keep & busy).sum() >= FEWEST_STEPS:
             keep &= busy
         if keep.sum() < FEWEST_STEPS:
-            return None
+            return UNEXPLAINED
         motion = whole.take(keep)
         two = [one for one in (self.first, self.second) if one in self.inputs]
         may_cross = self.form in {"sides", "body"} and len(two) == len(SIDES)
-        may_cross = may_cross and (self.third is None or self.third_crossed is not None)
+        may_cross = may_cross and (self.third is NO_SIGNAL or self.third_crossed is not NO_SIGNAL)
         made = self.fit_to(motion, DELAYS_S, crossed=False)
         # Laps of one radius are explained either way, for speed and yaw rate are proportional: where the
         # signals explain the motion as they are, nothing is reversed.
@@ -326,7 +354,6 @@ class Reading:
             crossed = self.fit_to(motion, DELAYS_S, crossed=True)
             one, other = (made, crossed) if compare(crossed.blocks, made.blocks) < CLEAR else (crossed, made)
             made = replace(one, other=other.blocks)
-        self.explained = made
         return made
 
     def _find_busy(self, motion: Motion) -> Flags:
@@ -356,34 +383,38 @@ class Reading:
         # The pose may be beside the axle's middle, unless its own turning is what drives it ahead.
         lever = bool(np.dot(first, yaw) ** 2 < 0.5 * np.dot(first, first) * np.dot(yaw, yaw))
         beside = yaw[:, None] if lever else empty
+        driven, turned = (
+            fit(ahead, np.column_stack([first, beside]), motion.steps),
+            fit(yaw, second[:, None], motion.steps),
+        )
         made = Explained(
             motion,
             crossed,
             lag,
             delay,
-            fit(ahead, np.column_stack([first, beside]), motion.steps),
-            fit(yaw, second[:, None], motion.steps),
+            driven,
+            turned,
             (fit(ahead, beside, motion.steps).blocks, fit(yaw, empty, motion.steps).blocks),
             None,
+            (
+                measure_share(ahead, float(driven.gains[0]) * first),
+                measure_share(yaw, float(turned.gains[0]) * second),
+            ),
         )
         aside = self.columns_aside(motion.steps, lag, delay, crossed=crossed)
         if aside.size:
             across = motion.body.imag
-            made.aside = (
+            to_left = (
                 fit(across, np.column_stack([aside, beside]), motion.steps),
                 fit(across, beside, motion.steps).blocks,
             )
             asked = join_parts(first, aside[:, 0])
             hands = [fit_across(motion, [one, 1j * one], lever=lever) for one in (asked, np.conj(asked))]
             best = max(hands, key=lambda one: float(one.blocks.sum()))
-            made.across = best, fit_across(motion, [], lever=lever).blocks
-        made.shares = (
-            measure_share(ahead, float(made.ahead.gains[0]) * first),
-            measure_share(yaw, float(made.turned.gains[0]) * second),
-        )
+            in_plane = best, fit_across(motion, [], lever=lever).blocks
+            made = replace(made, aside=to_left, across=in_plane)
         for one in (self.first, self.second, self.third, self.third_crossed):
-            if one is not None:
-                one.forget()
+            one.forget()
         return made
 
     def _find_delay(self, motion: Motion, delays: Floats, *, crossed: bool) -> tuple[float, float]:
@@ -404,7 +435,7 @@ class Reading:
             columns = self.columns(part.steps, lag, delays[:, None], crossed=crossed)
             channels = list(zip((body.real, yaw), columns, limits, strict=True))
             total, aside = np.zeros(delays.size), self.third_crossed if crossed else self.third
-            if aside is not None and aside.moves:
+            if aside.moves:
                 across = aside.integrate(part.steps, lag, delays[:, None])
                 total -= [
                     yaw.size * np.log(_miss_across(body, one)) for one in join_parts(columns[0], across)

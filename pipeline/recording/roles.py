@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core import Floats
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import NO_CANDIDATE, Candidate, Case
+from pipeline.recording.drive import list_steered
 from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, compare, fit
-from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
+from pipeline.recording.findings import Finding
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, Motion, compare, fit
+from pipeline.recording.readings import SIDES, UNEXPLAINED, Bent, Explained, Held, Reading
 from pipeline.recording.units import resolve_steering
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import COMMANDED, CONFIGURED, DriveForm, DriveSource, Sources
-from pipeline.stages import Finding, Given, list_steered
 
 _STILL = 0.1
 """Gain of the motion on the drive below which a body stands: on ice it is .13 to .26 of the wheels."""
@@ -30,56 +31,59 @@ _MARGIN = 4.0
 """Gain of another command over the one by type and name that decides [nats]."""
 
 
-def read_drives(case: Case, motion: Motion) -> list[Candidate]:
+def read_drives(case: Case) -> Case:
     """The candidates for the command and for wheels that can be read, fitted to the motion.
 
-    The likeliest of each by type and name come first.
+    The likeliest of each by type and name come first. Of wheels that are the motion nothing explains more.
     """
     commands, wheels = (case.sources.rank_drives(role) for role in ("command", "wheels"))
-    drives, taken = [], set()
+    if not case.has_pose:
+        stand_ins = {signal.topic for signal in case.wheels.source.signals}
+        commands = [one for one in commands if not stand_ins & {signal.topic for signal in one.signals}]
+        wheels = []
+    drives, taken = list[Candidate](), set()
     for is_measured, sources in ((False, commands), (True, wheels)):
         for rank, source in enumerate(sources[:_MOST]):
             key = (source.form, source.signals)
-            reading = None if key in taken else case.read(source, is_measured=is_measured)
-            if reading is None and key not in taken and is_measured and source == case.sources.wheels:
-                reading = _read_by_motion(case, source, motion)
-            if reading is None and key not in taken and source.form is DriveForm.JOINTS:
+            if key in taken:
+                continue
+            taken.add(key)
+            reading = case.read(source, is_measured=is_measured)
+            if not reading.form and is_measured and source == case.sources.wheels:
+                reading = _read_by_motion(case, source)
+            if not reading.form and source.form is DriveForm.JOINTS:
                 # A tricycle has one wheel that drives, and no sides.
                 reading = case.read(source, is_measured=is_measured, kind="ackermann")
-            taken.add(key)
-            if reading is not None:
-                drives.append(Candidate(source, reading, rank, is_measured))
-    for drive in drives:
-        drive.reading.explain(motion)
-        resolve_steering(case, drive, motion)
-        resolve_turn(case, drive, motion)
+            if reading.form:
+                drive = Candidate(source, reading.fitted(case.motion), rank, is_measured)
+                drives.append(_read_turn(case, resolve_steering(case, drive)))
     return _leave_out_sizes(case, drives)
 
 
-def leave_out_of_ground(case: Case, given: Given, motion: Motion) -> None:
+def leave_out_of_ground(case: Case) -> Case:
     """Leave out velocities along the axes of a map: turned by the heading, they are of rolling wheels.
 
     Those without a number ahead say nothing of it, nor of a base that moves sideways.
     """
     if not case.moves_sideways or case.vehicle.kinematics.has_inputs("sideways"):
-        return
+        return case
     of_role = (case.sources.rank_drives(role) for role in ("command", "wheels"))
     drives = {source.signals: source for sources in of_role for source in sources}
     for source in drives.values():
-        reading = None
+        reading = Reading()
         if source.form is DriveForm.BODY and source.reason != CONFIGURED:
             reading = case.read(source, is_measured=True)
-        if reading is not None and (why := _explain_of_ground(reading, motion)):
+        if why := _explain_of_ground(reading, case.motion):
             what = {"what": f"{source}: {why}"}
             case.findings.append(Finding("numbers_not_used", "info", source.signals[0].topic, what))
-            case.leave_out(source)
-    case.moves_sideways = given.may_move_sideways(case.sources)
+            case = case.leave_out(source)
+    return replace(case, moves_sideways=case.given.may_move_sideways(case.sources))
 
 
 def _explain_of_ground(reading: Reading, motion: Motion) -> str:
     """Why the velocities of a reading say nothing of a body that moves sideways; empty where they may."""
     ahead, aside, turning = reading.first, reading.third, reading.second
-    if ahead is None or aside is None or not aside.moves:
+    if not aside.moves:
         return ""
     if not ahead.times.size:
         return "it has no number for the speed ahead"
@@ -87,7 +91,7 @@ def _explain_of_ground(reading: Reading, motion: Motion) -> str:
     known = np.searchsorted(ahead.times, at, side="right") > 0
     at, headings = at[known], [motion.middle[known]]
     velocity = np.interp(at, ahead.times, ahead.values) + 1j * np.interp(at, aside.times, aside.values)
-    if turning is not None and turning.moves:
+    if turning.moves:
         # An odometry has a heading of its own.
         turned = np.cumsum(turning.values[:-1] * np.diff(turning.times))
         headings.append(np.interp(at, turning.times[1:], turned))
@@ -99,11 +103,12 @@ def _explain_of_ground(reading: Reading, motion: Motion) -> str:
     return ""
 
 
-def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading | None:
-    """Joints whose names show no side, each put on the side on which it turns; None without."""
+def _read_by_motion(case: Case, source: DriveSource) -> Reading:
+    """Joints whose names show no side, each put on the side on which it turns."""
+    motion = case.motion
     columns = case.extraction.columns.get(source.signals[0].topic)
     if source.form is not DriveForm.JOINTS or columns is None or case.configuration.wheels.left is not None:
-        return None
+        return Reading()
     times, joints = case.extraction.read_rates(source)
     body = np.column_stack([motion.body.real, motion.yaw])
     sides: dict[str, list[str]] = {"left": [], "right": []}
@@ -119,20 +124,16 @@ def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading 
         if min(abs(made.t)) > CLEAR:
             sides["left" if made.gains[0] * made.gains[1] < 0.0 else "right"].append(name)
     if not (sides["left"] and sides["right"]):
-        return None
+        return Reading()
     line = "; ".join(f"{side} = {json.dumps(names, ensure_ascii=False)}" for side, names in sides.items())
     case.correct("wheels", "sides by motion", {"source": str(source), **sides}, line, dict(sides))
     section = case.complete().wheels
     return case.read(source, is_measured=True, section=section)
 
 
-def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]:
+def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> Case:
     """The candidates without wheel speeds that are sizes alone, as of sensors that know no direction."""
-    asked = [
-        one.reading.first.values
-        for one in drives
-        if one.reading.form == "body" and one.is_sure and one.reading.first is not None
-    ]
+    asked = [one.reading.first.values for one in drives if one.reading.form == "body" and one.is_sure]
     back = max((min(_share_back(one), _share_back(-one)) for one in asked), default=0.0)
     signed = []
     for one in drives:
@@ -141,21 +142,18 @@ def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]
             signed.append(one)
             continue
         case.findings.append(Finding("wheels_unsigned", "warning", "wheels", {"wheels": str(one.source)}))
-        case.leave_out(one.source)
-    return signed
+        case = case.leave_out(one.source)
+    return replace(case, drives=tuple(signed))
 
 
-def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | None, Candidate | None]:
+def ask_roles(case: Case) -> Case:
     """Command and wheels: those by type and name, unless the motion says otherwise."""
-    case.is_still = _is_still(case, drives)
-    if case.is_still:
-        for one in drives:
-            one.reading.explained = None
+    if _is_still(case):
+        nothing = [replace(one, reading=replace(one.reading, explained=UNEXPLAINED)) for one in case.drives]
+        case = replace(case, is_still=True, drives=tuple(nothing))
+    drives = case.drives
     sure = [one for one in drives if one.is_sure and not one.reading.is_constant]
-    earliest = min(
-        (one.reading.explained.lag + one.reading.explained.delay for one in sure if one.reading.explained),
-        default=0.0,
-    )
+    earliest = min((one.reading.explained.lag + one.reading.explained.delay for one in sure), default=0.0)
     named = command = _find(drives, case.sources.command)
     # Plain numbers have their roles by name alone: the motion may follow both, and tell them apart. Where
     # it does not follow the command, the vehicle is driven by other means.
@@ -163,35 +161,38 @@ def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | N
     rivals = [
         one for one in sure if not one.is_measured or (is_followed and one.source.form is DriveForm.SIDES)
     ]
-    if rivals and (command is None or command.source.reason != CONFIGURED):
+    if rivals and command.source.reason != CONFIGURED:
         rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in rivals}
         best = max(rivals, key=lambda one: rates[id(one)])
-        if command is None or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
-            if command is not None:
+        if not command.is_there or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
+            if command.is_there:
                 _report_command(case, best, command)
             command = best
-    if command is not None and _is_no_command(command):
+    if command.is_there and _is_no_command(command):
         what = {"what": f"{command.source}: it measures the motion, which equals it at once"}
         case.findings.append(Finding("numbers_not_used", "info", command.source.signals[0].topic, what))
-        case.sources, command = replace(case.sources, command=None), None
-    wheels = _find_wheels(case, drives, command)
-    if wheels is not None and command is not None and wheels.source.signals == command.source.signals:
+        case, command = replace(case, sources=replace(case.sources, command=None)), NO_CANDIDATE
+    if not case.has_pose:
+        # Wheels of which nothing is asked show nothing.
+        return replace(case, command=command, motion=case.motion if command.is_there else NO_MOTION)
+    wheels = _find_wheels(case, command)
+    if wheels.is_there and wheels.is_of(command.source):
         # What is named as a command measures what the other asks for.
-        is_sides = named is not None and named is not command and named.reading.form == "sides"
-        return command, named if is_sides else None
-    if wheels is None and case.sources.wheels is None:
+        is_sides = named is not command and named.reading.form == "sides"
+        wheels = named if is_sides else NO_CANDIDATE
+    elif not wheels.is_there and case.sources.wheels is None:
         # A pair of sides that is no command measures the wheels.
-        is_free = command is None
+        is_free = not command.is_there
         spare = [one for one in rivals if one is not command and one.reading.form == "sides"]
         spare = [
             one
             for one in spare
             if is_free or one.source.form is DriveForm.SIDES or is_named_measured(one.reading.name)
         ]
-        wheels = max(spare, key=lambda one: -one.rank, default=None)
-        if wheels is not None and command is not None and command.reading.form == "sides":
-            wheels = wheels if is_named_measured(wheels.reading.name) else None
-    return command, wheels
+        wheels = max(spare, key=lambda one: -one.rank, default=NO_CANDIDATE)
+        if command.reading.form == "sides" and not is_named_measured(wheels.reading.name):
+            wheels = NO_CANDIDATE
+    return replace(case, command=command, wheels=wheels)
 
 
 _HELD = 0.5
@@ -207,14 +208,14 @@ def _is_no_command(one: Candidate) -> bool:
     return float(np.mean([each.held_share for each in one.reading.inputs])) < _HELD
 
 
-def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | None) -> Candidate | None:
+def _find_wheels(case: Case, command: Candidate) -> Candidate:
     """Wheels by type and name, or others that the motion follows where it does not follow these."""
-    source = case.sources.wheels
+    source, drives = case.sources.wheels, case.drives
     wheels = _find(drives, source)
-    made = None if wheels is None else wheels.reading.explained
+    made = wheels.reading.explained
     # An encoder that dies is settled later: of that of the other side something is followed.
-    is_open = wheels is None or (
-        made is not None and max(abs(made.ahead.t[0]), abs(made.turned.t[0])) < CLEAR
+    is_open = not wheels.is_there or (
+        made.is_known and max(abs(made.ahead.t[0]), abs(made.turned.t[0])) < CLEAR
     )
     if source is None or source.reason == CONFIGURED or not is_open:
         return wheels
@@ -222,7 +223,7 @@ def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | N
     if not others:
         return wheels
     values = {
-        "kind": "sides not found" if wheels is None else "not followed",
+        "kind": "not followed" if wheels.is_there else "sides not found",
         "wheels": str(source),
         "taken": str(others[0].source),
     }
@@ -230,11 +231,12 @@ def _find_wheels(case: Case, drives: Sequence[Candidate], command: Candidate | N
     return others[0]
 
 
-def _is_still(case: Case, drives: Sequence[Candidate]) -> bool:
+def _is_still(case: Case) -> bool:
     """Whether the body hardly moves where the drive does: it is stuck, lifted, or another body."""
-    first = _find(drives, case.sources.command) or _find(drives, case.sources.wheels)
-    made = None if first is None else first.reading.explained
-    if first is None or made is None or first.reading.form == "steering":
+    named = (_find(case.drives, source) for source in (case.sources.command, case.sources.wheels))
+    first = next((one for one in named if one.is_there), NO_CANDIDATE)
+    made = first.reading.explained
+    if not made.is_known or first.reading.form == "steering":
         return False
     scale = case.vehicle.wheel_radius_m if case.is_known and first.reading.form == "sides" else 1.0
     least = _STILL * scale if case.is_known or first.reading.form == "body" else _STILL * _SMALLEST_M
@@ -253,22 +255,22 @@ _FEWEST_BLOCKS = 12
 """Least number of blocks of the motion, a minute: in less a body that is driven may not show it."""
 
 
-def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> None:
+def ask_whose_pose(case: Case) -> Case:
     """Tell poses that move otherwise than all that is commanded or measured, as those of another body.
 
     Of a log of which a part is lost, it is not known whether they do so unless something is seen to drive
     them: it is told, too.
     """
-    first = _find(drives, case.sources.command)
-    made = None if first is None else first.reading.explained
-    if first is None or any(one.is_sure for one in drives):
-        return
+    first, motion = _find(case.drives, case.sources.command), case.motion
+    made = first.reading.explained
+    if not (case.has_pose and first.is_there) or any(one.is_sure for one in case.drives):
+        return case
     if case.extraction.data.losses and first.source.reason != CONFIGURED:
         values = {"kind": "log damaged", "pose": str(case.sources.pose), "command": str(first.source)}
         case.findings.append(Finding("not_driven", "error", "pose", values))
-        return
-    if made is None or first.reading.form != "body":
-        return
+        return case
+    if not made.is_known or first.reading.form != "body":
+        return case
     asked = first.reading.columns(motion.steps, made.lag, made.delay, crossed=False)[0]
     positions = np.append(0.0, np.cumsum(motion.body * np.exp(1j * (np.cumsum(motion.yaw) - motion.yaw))))
     rows = np.append(np.flatnonzero(np.diff(motion.steps.start // _FAR_S, prepend=-1.0)), asked.size)
@@ -277,7 +279,7 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
     )
     is_unlike = max(made.shares) < _UNLIKE and made.blocks.size >= _FEWEST_BLOCKS
     if not is_unlike or moved < _GOES * expected:
-        return
+        return case
     about: dict[str, object] = {
         "kind": "another body",
         "value": moved,
@@ -285,10 +287,11 @@ def report_stranger(case: Case, drives: Sequence[Candidate], motion: Motion) -> 
         "command": str(first.source),
     }
     case.findings.append(Finding("not_driven", "error", "pose", about))
+    return case
 
 
-def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
-    return next((one for one in drives if source is not None and one.source.signals == source.signals), None)
+def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate:
+    return next((one for one in drives if one.is_of(source)), NO_CANDIDATE)
 
 
 def _report_command(case: Case, chosen: Candidate, other: Candidate) -> None:
@@ -296,20 +299,22 @@ def _report_command(case: Case, chosen: Candidate, other: Candidate) -> None:
     case.findings.append(Finding("role_by_motion", "info", "command", values))
 
 
-def resolve_stamps(case: Case, command: Candidate | None) -> None:
+def ask_stamps(case: Case) -> Case:
     """Take the times of recording of a command that is stamped after it was recorded."""
-    if case.ahead is None or command is None or command.source.signals != case.ahead[0].signals:
-        return
+    command = case.command
+    if case.ahead is None or not command.is_of(case.ahead[0]):
+        return case
     values = {"source": str(command.source), "ahead_s": case.ahead[1]}
     case.correct("command", "clock ahead", values, 'time = "log"', {"time": "log"})
+    return case
 
 
-def name_sources(case: Case, command: Candidate | None, wheels: Candidate | None) -> Sources:
-    """The sources with these roles, without notes on a choice by name that no longer holds."""
+def name_sources(case: Case) -> Sources:
+    """The sources with their roles, without notes on a choice by name that no longer holds."""
     made = case.sources
-    for role, drive in (("command", command), ("wheels", wheels)):
-        before, source = getattr(made, role), None if drive is None else drive.source
-        if source is None or source == before:
+    for role, drive in (("command", case.command), ("wheels", case.wheels)):
+        before, source = getattr(made, role), drive.source
+        if not drive.is_there or source == before:
             continue
         rest = [one for one in (before, *made.others.get(role, ())) if one is not None and one != source]
         notes = tuple(note for note in made.notes if not note.startswith(f"{role}:"))
@@ -331,58 +336,70 @@ _LARGEST = 0.95
 """Quantile that is the largest of a motion: beyond it are poses that jumped."""
 
 
-def find_kind(case: Case, wheels: Candidate | None, motion: Motion) -> str:
+def ask_kind(case: Case) -> Case:
+    """The kind of the vehicle that wheels and command show."""
+    if not case.has_pose:
+        # Wheels stand in for a pose as what they are.
+        return replace(case, kind="ackermann" if case.wheels.reading.form == "steering" else "")
+    case = _find_kind(case)
+    if case.wheels.is_there and not case.kind:
+        case = _leave_out_steered(case)
+    is_steered = case.command.reading.form == "steering" and not case.kind
+    return replace(case, kind="ackermann") if is_steered else case
+
+
+def _find_kind(case: Case) -> Case:
     """A car, if joints of the wheels' topic steer and the body turns by them; else nothing."""
-    given = case.configuration.vehicle.list_values().get("kind")
+    wheels, given = case.wheels, case.configuration.vehicle.list_values().get("kind")
     kind = str(given or (case.vehicle.kind if case.is_known else "ackermann"))
     if case.moves_sideways:
         # Wheels of which each moves the body sideways as those with rollers do.
-        is_mecanum = wheels is not None and wheels.reading.form == "sides" and wheels.sign("aside")
-        return "" if case.is_known else "mecanum" if is_mecanum else "omni"
-    if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
-        return ""
-    return "ackermann" if case.read_again(wheels, motion, kind) else ""
+        is_mecanum = wheels.reading.form == "sides" and wheels.sign("aside")
+        return replace(case, kind="" if case.is_known else "mecanum" if is_mecanum else "omni")
+    if wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
+        return case
+    again = case.read_again(kind)
+    return replace(again, kind=kind) if again is not case and again.wheels.sign("turned") else case
 
 
-def leave_out_steered(case: Case, wheels: Candidate) -> bool:
-    """Leave out wheels beside joints that steer, of a vehicle that is no car; whether there are any."""
-    is_given = case.is_known or "kind" in case.configuration.vehicle.list_values()
+def _leave_out_steered(case: Case) -> Case:
+    """Leave out wheels beside joints that steer, of a vehicle that is no car."""
+    wheels, is_given = case.wheels, case.is_known or "kind" in case.configuration.vehicle.list_values()
     if is_given or wheels.source.form is not DriveForm.JOINTS:
-        return False
+        return case
     steered = list_steered(case.extraction.columns[wheels.source.signals[0].topic])
     if not steered:
-        return False
+        return case
     values = {"wheels": str(wheels.source), "joints": list(steered)}
     case.findings.append(Finding("wheels_steered", "warning", "wheels", values))
-    case.sources = replace(case.sources, wheels=None)
-    return True
+    return replace(case, sources=replace(case.sources, wheels=None), wheels=NO_CANDIDATE)
 
 
-def resolve_turn(case: Case, drive: Candidate, motion: Motion) -> None:
+def _read_turn(case: Case, drive: Candidate) -> Candidate:
     """Read a body command as speed and steering angle where the body turns by these, as some cars do."""
     reading, made = drive.reading, drive.reading.explained
     first, second = reading.first, reading.second
     is_car = not case.is_known or case.vehicle.kind == "ackermann"
     is_given = case.configuration.command.yaw_rate_topic is not None or case.moves_sideways
     is_open = is_car and not is_given and not drive.is_measured and reading.form == "body"
-    if not is_open or first is None or second is None or made is None or len(reading.inputs) < len(SIDES):
-        return
+    if not (is_open and made.is_known) or len(reading.inputs) < len(SIDES):
+        return drive
     bent = Bent(first, second.times, second.values)
-    steered = Reading("steering", reading.name, first, bent)
-    other = steered.explain(motion)
-    if other is None or not other.sign("turned") or made.crossed:
-        return
-    rivals = [made, _limit_turn(reading, made).explain(motion)]
-    if all(_turns_better(other, one) for one in rivals if one is not None):
-        drive.reading, drive.source = steered, replace(drive.source, form=DriveForm.STEERING)
-        drive.is_angle = True
+    steered = Reading("steering", reading.name, first, bent).fitted(case.motion)
+    other = steered.explained
+    if not other.sign("turned") or made.crossed:
+        return drive
+    rivals = [made, _limit_turn(reading, made).explain(case.motion)]
+    if not all(_turns_better(other, one) for one in rivals if one.is_known):
+        return drive
+    return replace(
+        drive, reading=steered, source=replace(drive.source, form=DriveForm.STEERING), is_angle=True
+    )
 
 
 def _limit_turn(reading: Reading, made: Explained) -> Reading:
     """Yaw rates of a body command as far as the steering reaches: beyond it they grow with the speed, too."""
     first, second = reading.first, reading.second
-    assert first is not None  # noqa: S101 - it has both
-    assert second is not None  # noqa: S101 - it has both
     ahead, turned = np.abs(made.motion.body.real), np.abs(made.motion.yaw)
     moved = ahead > LIVE_SHARE * float(np.quantile(ahead, _LARGEST))
     bend = float(np.quantile(turned[moved] / ahead[moved], _LARGEST)) / abs(float(made.turned.gains[0]))
@@ -397,10 +414,11 @@ def _turns_better(one: Explained, other: Explained) -> bool:
     return gains[0].size == gains[1].size and compare(gains[0], gains[1]) > CLEAR
 
 
-def report_turn(case: Case, command: Candidate | None) -> None:
-    """A body command that holds steering angles; see `resolve_turn`."""
-    if command is None or not command.is_angle:
-        return
+def ask_angle(case: Case) -> Case:
+    """A body command that holds steering angles; see `_read_turn`."""
+    command = case.command
+    if not command.is_angle:
+        return case
     speed, turn = command.source.signals
     values = {
         "kind": "steering angles",
@@ -409,3 +427,4 @@ def report_turn(case: Case, command: Candidate | None) -> None:
         "turn": str(turn),
     }
     case.findings.append(Finding("command_corrected", "warning", "command", values))
+    return case

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
-from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare, fit
+from pipeline.recording.findings import Finding
+from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit
 from pipeline.recording.readings import DELAYS_S, Reading
 from pipeline.sources import PoseContent
-from pipeline.stages import Finding
 
 _HALF_TURN = 180.0
 _CHANGES: Mapping[str, Mapping[str, object]] = {
@@ -20,17 +20,17 @@ _CHANGES: Mapping[str, Mapping[str, object]] = {
 }
 
 
-def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Motion:
-    """The motion in the frame in which the readings explain it, and the readings fitted to it."""
+def ask_frame(case: Case) -> Case:
+    """The frame of the motion in which the readings explain it."""
     source, section = case.sources.pose, case.configuration.pose
     if source is None or source.content is not PoseContent.POSE:
-        return motion
-    turned, margin, other_deg = find_frame(motion, readings)
+        return case
+    turned, margin, other_deg = find_frame(case.motion, [drive.reading for drive in case.drives])
     if other_deg is not None and section.heading_deg is None:
         values = {"value": other_deg, "source": str(source)}
         case.findings.append(Finding("pose_undecided", "warning", "pose", values))
     if not margin:
-        return motion
+        return case
     if section.heading_deg is not None:
         about = {
             "kind": "heading",
@@ -39,27 +39,63 @@ def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Moti
             "offset_deg": turned.offset_deg,
         }
         case.findings.append(Finding("pose_contradicted", "warning", "pose", about))
-        return motion
+        return case
     if turned.flip:
         flipped = {"value": margin, "source": str(source)}
         case.findings.append(Finding("pose_flipped", "error", "pose", flipped))
-    for one in readings:
-        one.explain(turned)
-    return turned
+    return case.fit(turned)
 
 
-def report_signs(
-    case: Case, motion: Motion, command: Candidate | None, wheels: Candidate | None, gyro: Reading | None
-) -> None:
+def ask_signs(case: Case) -> Case:
     """Correct what goes the other way than all other signals, or tell it."""
-    signs: dict[tuple[str, Axis], int] = {}
-    for name, drive in (("command", command), ("wheels", wheels)):
-        if drive is not None:
-            axes: tuple[Axis, ...] = ("ahead", "turned", "aside")
-            sign = drive.sign if drive is command else drive.sign_as_motion
-            signs |= {(name, axis): sign(axis) for axis in axes}
-    if gyro is not None and gyro.explained is not None:
-        signs["gyro", "turned"] = gyro.explained.sign("turned")
+    if not case.is_judged:
+        report = _report_signs if case.has_pose else _report_opposite
+        report(case)
+    if not case.wheels.is_there or not case.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
+        return case
+    return case.read_again("ackermann" if case.kind == "ackermann" else "differential")
+
+
+def _report_opposite(case: Case) -> None:
+    """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
+    command, wheels = case.command, case.wheels
+    explained = command.reading.explained
+    if not command.is_sure:
+        return
+    verbs = list[str]()
+    if is_crossed(command):
+        change = 'reversed = "left" or "right"'
+        margin: float | None = explained.sign_margin
+    else:
+        verbs = [
+            verb
+            for verb, sign in (("drive", command.sign("ahead")), ("turn", command.sign("turned")))
+            if sign < 0
+        ]
+        if not verbs:
+            return
+        changes = {"drive": "sign = -1 and exchanged = true", "turn": "exchanged = true"}
+        change = changes[verbs[0]] if len(verbs) == 1 else "sign = -1"
+        if wheels.reading.form != "sides":
+            change = "sign = -1"
+        margin = explained.moves
+    values = {
+        "kind": "command and wheels",
+        "verbs": verbs,
+        "source": str(command.source),
+        "change": change,
+        "value": margin,
+    }
+    case.findings.append(Finding("signs_contradict", "error", "command, wheels", values))
+
+
+def _report_signs(case: Case) -> None:
+    """Correct what goes the other way than all other signals and the pose, or tell it."""
+    command, wheels, motion = case.command, case.wheels, case.motion
+    axes: tuple[Axis, ...] = ("ahead", "turned", "aside")
+    signs = {("command", axis): command.sign(axis) for axis in axes}
+    signs |= {("wheels", axis): wheels.sign_as_motion(axis) for axis in axes}
+    signs["gyro", "turned"] = case.gyro.explained.sign("turned")
     up, offset = motion.up, motion.offset_deg
     if up != "z" and -1 in {sign for (_, axis), sign in signs.items() if axis == "turned"}:
         # Neither way along another axis is usual.
@@ -70,7 +106,7 @@ def report_signs(
         signs = {key: sign if key[1] == "turned" else -sign for key, sign in signs.items()}
     made = find_reversed(signs)
     if made.rivals:
-        _report_either(case, made, signs, command, wheels)
+        _report_either(case, made, signs)
     else:
         for fault in made.faults:
             if fault == "pose_backward":
@@ -78,14 +114,14 @@ def report_signs(
             elif fault == "pose_mirrored":
                 up, offset = up.removeprefix("-") if up.startswith("-") else f"-{up}", -offset
             else:
-                _report_fault(case, fault, command, wheels)
+                _report_fault(case, fault)
     _report_frame(case, up, 180.0 - (180.0 - offset) % 360.0, signs)
 
 
 def rate_map_axes(reading: Reading) -> float:
     """Vuong's statistic of commands along the axes of a map against those along the body's; zero of none."""
     made = reading.explained
-    if made is None or made.across is None:
+    if made.across is None:
         return 0.0
     along = replace(made.motion, middle=np.zeros(made.motion.middle.size), flip=False, offset_deg=0.0)
     other = reading.fit_to(along, DELAYS_S, crossed=made.crossed)
@@ -95,26 +131,29 @@ def rate_map_axes(reading: Reading) -> float:
     return compare(one, own) if float((one - own).sum()) > LEAST_NATS * along.moved.size else 0.0
 
 
-def report_axes(case: Case, command: Candidate | None) -> None:
+def ask_axes(case: Case) -> Case:
     """Tell commands along the axes of a map, which a base that moves sideways turns by its heading."""
-    margin = 0.0 if command is None else rate_map_axes(command.reading)
-    if command is None or margin < CLEAR:
-        return
+    command = case.command
+    margin = rate_map_axes(command.reading)
+    if margin < CLEAR:
+        return case
     values = {"value": margin, "source": str(command.source)}
     case.findings.append(Finding("command_of_map", "error", "command", values))
+    return case
 
 
-def report_speed_alone(case: Case, drives: Sequence[Candidate | None]) -> None:
+def ask_yaw_rate(case: Case) -> Case:
     """Tell speeds that come without a yaw rate, as of wheels on a bus: they say nothing of the heading."""
-    for drive in drives:
-        made = None if drive is None else drive.reading.explained
-        if drive is None or made is None or drive.reading.form != "body" or drive.reading.second is None:
+    for drive in (case.command, case.wheels):
+        made = drive.reading.explained
+        if not made.is_known or drive.reading.form != "body":
             continue
         # A vehicle that is driven straight on, and drifts, does not turn round.
         if drive.reading.second.moves or np.ptp(np.cumsum(made.motion.yaw)) < np.pi:
             continue
         topic = drive.source.signals[0].topic
         case.findings.append(Finding("no_yaw_rate", "warning", topic, {"source": str(drive.source)}))
+    return case
 
 
 def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
@@ -130,12 +169,11 @@ def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axi
         case.correct("pose", fault, off, line, {"heading_deg": float(f"{offset:g}")})
 
 
-def _report_fault(
-    case: Case, fault: str, command: Candidate | None, wheels: Candidate | None, others: Sequence[str] = ()
-) -> None:
+def _report_fault(case: Case, fault: str, others: Sequence[str] = ()) -> None:
     """Correct or report a fault; the sign of a gyro is fitted by `stages.align`."""
-    drive = wheels if fault.startswith("wheels") else command
-    if fault == "gyro" or drive is None:
+    wheels = case.wheels
+    drive = wheels if fault.startswith("wheels") else case.command
+    if fault == "gyro" or not drive.is_there:
         return
     change: dict[str, object] = dict(_CHANGES.get(fault, {}))
     is_car = drive.reading.form == "steering"
@@ -150,17 +188,11 @@ def _report_fault(
     case.findings.append(Finding(name, "error", role, values))
 
 
-def _report_either(
-    case: Case,
-    made: Reversal,
-    signs: dict[tuple[str, Axis], int],
-    command: Candidate | None,
-    wheels: Candidate | None,
-) -> None:
+def _report_either(case: Case, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
     """Two signals that contradict each other, with what mends the one and the other."""
     ways = (made.faults, *made.rivals)
     if all(len(names) == 1 and names[0].startswith("command") for names in ways):
-        _report_fault(case, made.faults[0], command, wheels, [names[0] for names in made.rivals])
+        _report_fault(case, made.faults[0], [names[0] for names in made.rivals])
         return
     against = sorted({name for (name, _), sign in signs.items() if sign < 0})
     axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
@@ -191,21 +223,16 @@ _LEAST_M = 0.02
 """Least distance [m] that is told, as a sensor's place is measured by hand."""
 
 
-def report_mounting(case: Case, drives: Sequence[Candidate | None]) -> None:
-    """Tell the angle and the place of poses that are not those of the body; either may be the ground's.
-
-    Args:
-        case: the log, its roles and signs settled.
-        drives: what may drive the body, the surest first.
-    """
-    known = [one.reading for one in drives if one is not None and one.is_sure]
+def ask_mounting(case: Case) -> Case:
+    """Tell the angle and the place of poses that are not those of the body; either may be the ground's."""
+    known = [one.reading for one in (case.wheels, case.command) if one.is_sure]
     pose = case.sources.pose
     is_plain = pose is not None and pose.content is PoseContent.POSE and "pose" not in case.changes
-    if not known or known[0].explained is None or not is_plain or case.moves_sideways:
-        return
+    if not known or not is_plain or case.moves_sideways:
+        return case
     motion = known[0].explained.motion
     if motion.flip or motion.offset_deg:
-        return
+        return case
     ahead, elapsed = motion.body.real, motion.steps.end - motion.steps.start
     columns = np.column_stack([ahead, motion.yaw, ahead / elapsed * motion.yaw])
     made = fit(motion.body.imag, columns, motion.steps)
@@ -222,3 +249,4 @@ def report_mounting(case: Case, drives: Sequence[Candidate | None]) -> None:
     if abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and known[0].form != "steering":
         apart = {"value": lever, "half_m": 1.96 * abs(lever / of_lever), "pose": str(pose)}
         case.findings.append(Finding("pose_lever", "info", "pose", apart))
+    return case

@@ -11,12 +11,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core import CONFIDENCE, NORMAL_95, Floats, Ints, fit_robustly, robust_spread, student_quantile
-from pipeline.recording.case import Candidate, Case
+from pipeline.recording.case import Case
+from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
-from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare
-from pipeline.recording.readings import DELAYS_S, GRID_S, SIDES, Bent, Explained, Held, Reading
+from pipeline.recording.motion import CLEAR, LEAST_NATS, NO_MOTION, Motion, compare
+from pipeline.recording.readings import (
+    DELAYS_S,
+    GRID_S,
+    NO_SIGNAL,
+    SIDES,
+    UNEXPLAINED,
+    Bent,
+    Explained,
+    Held,
+    Reading,
+)
 from pipeline.run import LIVE_SHARE
-from pipeline.stages import Finding
 
 _PERIODS = 3.0
 """Gap in the commands [usual periods] above which they are silent: a shorter one is jitter."""
@@ -64,36 +74,27 @@ class CommandTimeout:
     silences: int
 
 
-def resolve_timeout(case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> None:
-    """Hold the command as long as what follows it does.
-
-    Args:
-        case: the log.
-        command: the candidate for the command, whose reading is replaced.
-        wheels: that for the wheels, which show it best.
-        motion: of the poses, or of the wheels that stand in for them.
-    """
-    if command is None:
-        return
-    rolled = None
-    if wheels is not None and len(wheels.reading.inputs) == len(SIDES) and wheels.reading.form != "steering":
+def ask_timeout(case: Case) -> Case:
+    """Hold the command as long as what follows it does; wheels show it best."""
+    command, wheels, motion = case.command, case.wheels, case.motion
+    rolled = NO_MOTION
+    if len(wheels.reading.inputs) == len(SIDES) and wheels.reading.form != "steering":
         rolled = roll_wheels(wheels.reading)
-    is_sides = rolled is not None and wheels is not None and wheels.reading.form == "sides"
+    is_sides = rolled.is_known and wheels.reading.form == "sides"
     width = 1.0 if is_sides else case.vehicle.kinematics.turning_width_m(case.vehicle)
-    shown_by = rolled or motion
+    shown_by = rolled if rolled.is_known else motion
     timeout = find_timeout(command.reading, shown_by, 0.5 * width)
     bursts = None if timeout is not None else find_hold(command.reading, shown_by)
     timeout = timeout or bursts
     if timeout is None:
-        return
+        return case
     if bursts is not None:
-        case.in_bursts = True
         timeout = _take_as_fast(command.reading, bursts, motion)
     hold_s = case.configuration.command.hold_s or timeout.seconds
     case.changes.setdefault("command", {})["hold_s"] = hold_s
     case.findings.append(_report(timeout, hold_s, in_bursts=bursts is not None))
-    command.reading = hold(command.reading, hold_s)
-    command.reading.explain(motion)
+    held = hold(command.reading, hold_s).fitted(motion)
+    return replace(case, command=replace(command, reading=held), in_bursts=bursts is not None)
 
 
 _GAINS = (0.8, 1.25)
@@ -107,7 +108,7 @@ def _take_as_fast(reading: Reading, bursts: CommandTimeout, motion: Motion) -> C
     """
     held = hold(reading, bursts.seconds)
     made, first = held.explain(motion), held.first
-    if reading.form != "body" or made is None or first is None or reading.first is None:
+    if reading.form != "body" or not made.is_known:
         return bursts
     times, values = reading.first.times, np.abs(reading.first.values)
     held_s = np.minimum(np.diff(times, append=np.inf), bursts.seconds)
@@ -206,9 +207,8 @@ def find_hold(reading: Reading, motion: Motion) -> CommandTimeout | None:
     long = waits[waits > _HOLDS_S[0]]
     if long.size < _FEWEST_WAITS or float(long.sum()) < _WAITING * float(np.ptp(stamps)):
         return None
-    before = reading.explained
-    made, reading.explained = reading.explain(motion), before
-    if made is None:
+    made = reading.explain(motion)
+    if not made.is_known:
         return None
     part, crossed = made.motion, made.crossed
 
@@ -356,12 +356,12 @@ def hold(reading: Reading, seconds: float) -> Reading:
         return reading
     period = _find_period(reading)
     first, second, third = (
-        None if one is None or isinstance(one, Bent) else _hold(one, seconds, period)
+        NO_SIGNAL if one is NO_SIGNAL or isinstance(one, Bent) else _hold(one, seconds, period)
         for one in (reading.first, reading.second, reading.third)
     )
-    if isinstance(reading.second, Bent) and first is not None:
+    if isinstance(reading.second, Bent):
         second = reading.second.drive(first)
-    return replace(reading, first=first, second=second, third=third)
+    return replace(reading, first=first, second=second, third=third, explained=UNEXPLAINED)
 
 
 def _hold(one: Held, seconds: float, period: float) -> Held:
@@ -393,34 +393,27 @@ _EARLIER_S = np.arange(-3.0, DELAYS_S[0], 0.05)
 """Delays [s] of commands that are stamped after nearly all that they do."""
 
 
-def resolve_delay(
-    case: Case, command: Candidate | None, wheels: Candidate | None, motion: Motion | None
-) -> None:
+def ask_delay(case: Case) -> Case:
     """Correct the times of a command that acts before it is sent, and tell a dead time.
 
     Three readings are compared: it acts before its stamp, which no command does; at once, however slowly what
     it drives follows; or after a dead time, as that of a drive, or of stamps that are early. Of poses, which
     are late themselves, the first one alone says something.
-
-    Args:
-        case: the log, with what its wheels do of the command.
-        command: the candidate for it.
-        wheels: the candidate for them.
-        motion: of the poses; None where wheels stand in for them.
     """
-    if command is None or not command.is_sure or case.configuration.command.late_s is not None:
-        return
+    command, is_driven = case.command, case.driven.is_known
+    if not command.is_sure or case.configuration.command.late_s is not None:
+        return case
     reading = command.reading
-    if case.driven is not None and wheels is not None:
-        followed, beside = "wheels", [one.topic for one in wheels.source.signals]
-        made = _compare_delays(replace(reading, third=None, third_crossed=None), case.driven)
-    elif motion is not None and reading.explained is not None and case.sources.pose is not None:
+    if is_driven:
+        followed, beside = "wheels", [one.topic for one in case.wheels.source.signals]
+        made = _compare_delays(replace(reading, third=NO_SIGNAL, third_crossed=NO_SIGNAL), case.driven)
+    elif case.sources.pose is not None:
         followed, beside = "pose", [case.sources.pose.topic]
         made = _compare_delays(reading, reading.explained)
     else:
-        return
-    if made is None or (made.delay > 0.0 and case.driven is None):
-        return
+        return case
+    if made is None or (made.delay > 0.0 and not is_driven):
+        return case
     if made.delay > 0.0:
         values = {
             "value": made.delay,
@@ -429,19 +422,19 @@ def resolve_delay(
             "followed": followed,
         }
         case.findings.append(Finding("command_delay", "info", "command", values))
-        return
+        return case
     late = round(-made.delay, 2)
     topics = [*(one.topic for one in command.source.signals), *beside]
     clocks = {case.extraction.clocks[topic].clock for topic in topics if topic in case.extraction.clocks}
-    by_body = reading.explained is not None and reading.explained.delay < -_ERROR_S
+    by_body = reading.explained.delay < -_ERROR_S
     if clocks == {"header"} and not by_body:
         # Times of recording are late by the way there; of two clocks either may be wrong.
         early = {"value": late, "source": str(command.source), "followed": followed}
         case.findings.append(Finding("command_late", "warning", "command", early))
-        return
+        return case
     wrong = {"source": str(command.source), "late_s": late, "followed": followed}
     case.correct("command", "late stamps", wrong, f"late_s = {late:g}", {"late_s": late})
-    case.driven = None if case.driven is None else replace(made, delay=made.delay + late)
+    return replace(case, driven=replace(made, delay=made.delay + late)) if is_driven else case
 
 
 def _compare_delays(reading: Reading, made: Explained) -> Explained | None:

@@ -19,10 +19,10 @@ from pipeline.recording.evidence import (
     find_wheel_unit,
     is_unit_exact,
 )
-from pipeline.recording.motion import Motion, measure_motion
-from pipeline.recording.readings import Bent, Reading
+from pipeline.recording.findings import Finding
+from pipeline.recording.motion import measure_motion
+from pipeline.recording.readings import Bent
 from pipeline.sources import DriveForm, PoseContent, plain_type
-from pipeline.stages import Finding
 
 JOYSTICK = "sensor_msgs/Joy"
 """Type of axes, whose numbers from -1 to 1 have no unit."""
@@ -30,150 +30,160 @@ _NEAR = 0.03
 """Spread of the logarithm of a gyro's scale."""
 
 
-def resolve_gyro(case: Case, motion: Motion) -> tuple[Motion, Reading | None]:
-    """The motion and the gyro, if there is one, fitted to it; one in degrees per second is corrected."""
-    gyro = case.read_gyro()
-    made = None if gyro is None else gyro.explain(motion)
-    if gyro is None or made is None or not made.sign("turned") or case.configuration.imu.unit is not None:
-        return motion, gyro
+def ask_gyro(case: Case) -> Case:
+    """The gyro fitted to the motion; one in degrees per second is corrected."""
+    if not case.has_pose:
+        # It measures the ground, of which wheels know nothing.
+        return case
+    gyro = case.read_gyro().fitted(case.motion)
+    case, made = replace(case, gyro=gyro), gyro.explained
+    if not made.sign("turned") or case.configuration.imu.unit is not None:
+        return case
     if abs(np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])) > 4.0 * _NEAR:
-        return motion, gyro
+        return case
     case.correct("imu", "gyro in degrees", {"gyro": gyro.name}, 'unit = "deg/s"', {"unit": "deg/s"})
     # Headings of positions alone are made of the gyro.
-    case.extraction.take_degrees()
-    motion, gyro = measure_motion(case.extraction.poses()) or motion, case.read_gyro()
-    if gyro is not None:
-        gyro.explain(motion)
-    return motion, gyro
+    case = replace(case, extraction=case.extraction.configure(imu=case.complete().imu))
+    again = measure_motion(case.extraction.poses())
+    return replace(case, gyro=case.read_gyro()).fit(again if again.is_known else case.motion)
 
 
-def resolve_lengths(
-    case: Case,
-    motion: Motion,
-    readings: Sequence[Reading],
-    command: Candidate | None,
-    wheels: Candidate | None,
-) -> Motion:
-    """The motion in metres, and the readings fitted to it."""
-    source = case.sources.pose
+def ask_metres(case: Case) -> Case:
+    """The unit of the positions."""
+    source, motion = case.sources.pose, case.motion
     if source is None or source.content is not PoseContent.POSE or case.configuration.pose.unit:
-        return motion
+        return case
     gains: dict[str, float | None] = {"body": None, "sides": None, "steering": None}
-    for drive in (command, wheels):
-        made = None if drive is None else drive.reading.explained
-        if drive is not None and made is not None and drive.sign("ahead") and not is_crossed(drive):
-            gains[drive.reading.form] = abs(float(made.ahead.gains[0]))
+    for drive in (case.command, case.wheels):
+        if drive.sign("ahead") and not is_crossed(drive):
+            gains[drive.reading.form] = abs(float(drive.reading.explained.ahead.gains[0]))
     radius = case.vehicle.wheel_radius_m if case.is_known else None
     unit = find_pose_unit(gains["body"] or gains["steering"], gains["sides"], radius)
     if unit == "m":
-        return motion
+        return case
     values = {"source": str(source), "unit": unit}
     case.correct("pose", "unit of positions", values, f'unit = "{unit}"', {"unit": unit})
-    case.extraction.configuration = case.complete()
+    case = replace(case, extraction=case.extraction.configure(pose=case.complete().pose))
     scaled = measure_motion(case.extraction.poses())
-    if scaled is None:
-        return motion
-    scaled = scaled.turn(flip=motion.flip, offset_deg=motion.offset_deg)
-    for one in readings:
-        one.explain(scaled)
-    return scaled
+    return case.fit(scaled.turn(flip=motion.flip, offset_deg=motion.offset_deg)) if scaled.is_known else case
 
 
-def resolve_steering(case: Case, drive: Candidate, motion: Motion) -> None:
+def resolve_steering(case: Case, drive: Candidate) -> Candidate:
     """Read a steering angle in the unit in which the body turns by it; which one it is is told later."""
     reading = drive.reading
     section = case.find_section(drive.source, is_measured=drive.is_measured)
     is_free = drive.source.form is DriveForm.STEERING and section.steering_unit is None
     if not is_free or drive.source.signals[1].unit or not isinstance(reading.second, Bent):
-        return
-    tried = {"rad": reading, "deg": replace(reading, second=reading.second.rescale(np.pi / 180.0))}
+        return drive
+    degrees = replace(reading, second=reading.second.rescale(np.pi / 180.0)).fitted(case.motion)
+    tried = {"rad": reading, "deg": degrees}
     nats, lengths = {}, dict[str, float | None]()
     for unit, one in tried.items():
-        made = one.explain(motion) if unit != "rad" else one.explained
-        nats[unit] = 0.0 if made is None else float((made.turned.blocks - made.none[1]).sum())
-        turns = made is not None and made.sign("turned") and made.sign("ahead")
-        lengths[unit] = (
-            abs(float(made.ahead.gains[0] / made.turned.gains[0])) if made is not None and turns else None
-        )
+        made = one.explained
+        nats[unit] = float((made.turned.blocks - made.none[1]).sum())
+        turns = made.sign("turned") and made.sign("ahead")
+        lengths[unit] = abs(float(made.ahead.gains[0] / made.turned.gains[0])) if turns else None
     known = case.vehicle.wheelbase_m if case.is_known else None
-    drive.steering = find_steering_unit(nats, lengths, known, str(drive.source))
-    if drive.steering.likeliest[1] == "deg":
-        reading.second, reading.explained = tried["deg"].second, tried["deg"].explained
+    steering = find_steering_unit(nats, lengths, known, str(drive.source))
+    return replace(drive, steering=steering, reading=tried[steering.likeliest[1]])
 
 
-def find_units(case: Case, command: Candidate | None, wheels: Candidate | None) -> None:
-    """Correct the units of the command and of the wheels, or tell two that are as likely."""
-    for role, one in (("command", command), ("wheels", wheels)):
-        if one is not None and one.reading.form == "steering":
-            _report_units(case, role, one, one.steering)
-    is_car = all(one is not None and one.source.form is DriveForm.STEERING for one in (command, wheels))
-    if is_car and command is not None and wheels is not None and _is_usable(command) and _is_usable(wheels):
-        _find_speed_units(case, command, wheels)
-    elif command is not None and command.reading.form != "sides" and _is_usable(command):
-        explained = command.reading.explained
-        if explained is None:
-            return
-        # A car turns by its wheelbase, and not by a unit.
-        turns = command.reading.form == "body" and command.sign("turned")
-        gains = [
-            abs(float(one.gains[0])) if is_seen else None
-            for is_seen, one in ((command.sign("ahead"), explained.ahead), (turns, explained.turned))
-        ]
-        beside = None if wheels is None or not wheels.is_sure else wheels.reading.explained
-        if wheels is not None and beside is not None and wheels.reading.form == "body":
-            # What wheels do of a command is its unit on any ground.
-            fits = (("ahead", beside.ahead), ("turned", beside.turned))
-            gains = [
-                gain / abs(float(one.gains[0])) if gain and wheels.sign(axis) else gain  # type: ignore[arg-type]
-                for gain, (axis, one) in zip(gains, fits, strict=True)
-            ]
+def ask_units(case: Case) -> Case:
+    """Units of the command and of the wheels, corrected, or two told that are as likely."""
+    if not case.has_pose:
+        _find_driven_unit(case)
+        return case
+    command, wheels = case.command, case.wheels
+    is_scaled = [
+        _report_units(case, role, one, one.steering)
+        for role, one in (("command", command), ("wheels", wheels))
+        if one.reading.form == "steering"
+    ]
+    is_car = all(one.source.form is DriveForm.STEERING for one in (command, wheels))
+    if is_car and _is_usable(command) and _is_usable(wheels):
+        is_scaled += _find_speed_units(case)
+    elif command.reading.form != "sides" and _is_usable(command):
         columns = case.extraction.columns.get(command.source.signals[0].topic)
         if columns is not None and plain_type(columns.type_name) == JOYSTICK:
-            case.is_scaled = False
-            return
-        units = find_body_units(gains, explained.shares, str(command.source))
-        _report_units(case, "command", command, units, gains)
-    if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
-        _find_wheel_unit(case, command, wheels)
-    if command is not None and command.reading.form == "sides" and _is_usable(command):
-        _find_side_unit(case, command, wheels)
+            return replace(case, is_scaled=False)
+        is_scaled.append(_find_body_units(case))
+    if wheels.reading.form == "sides" and not is_crossed(wheels):
+        _find_wheel_unit(case)
+    if command.reading.form == "sides" and _is_usable(command):
+        _find_side_unit(case)
+    return replace(case, is_scaled=all(is_scaled))
+
+
+def _find_driven_unit(case: Case) -> None:
+    """Unit of wheels that stand in for a pose, by the radius that the command and each would mean."""
+    command, wheels = case.command, case.wheels
+    explained = command.reading.explained
+    is_open = wheels.reading.form == "sides" and not case.is_known and command.reading.form != "sides"
+    if is_open and command.sign("ahead"):
+        correct_wheel_unit(case, wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
+
+
+def _find_body_units(case: Case) -> bool:
+    """Units of a command of the body, or of a car; whether it has any."""
+    command, wheels = case.command, case.wheels
+    explained = command.reading.explained
+    # A car turns by its wheelbase, and not by a unit.
+    turns = command.reading.form == "body" and command.sign("turned")
+    gains = [
+        abs(float(one.gains[0])) if is_seen else None
+        for is_seen, one in ((command.sign("ahead"), explained.ahead), (turns, explained.turned))
+    ]
+    beside = wheels.reading.explained
+    if wheels.is_sure and wheels.reading.form == "body":
+        # What wheels do of a command is its unit on any ground.
+        fits = (("ahead", beside.ahead), ("turned", beside.turned))
+        gains = [
+            gain / abs(float(one.gains[0])) if gain and wheels.sign(axis) else gain  # type: ignore[arg-type]
+            for gain, (axis, one) in zip(gains, fits, strict=True)
+        ]
+    units = find_body_units(gains, explained.shares, str(command.source))
+    return _report_units(case, "command", command, units, gains)
 
 
 _ALIKE = 1.5
 """Speeds of wheels over those commanded up to which both are in one unit: others are nine times apart."""
 
 
-def _find_side_unit(case: Case, command: Candidate, wheels: Candidate | None) -> None:
+def _find_side_unit(case: Case) -> None:
     """Unit of commanded wheel speeds: that of the wheels that follow them, else by the motion."""
+    command, wheels = case.command, case.wheels
     driven, unit = case.driven, case.changes.get("wheels", {}).get("unit")
-    if wheels is not None and wheels.reading.form == "sides" and driven is not None:
+    if wheels.reading.form == "sides" and driven.is_known:
         if unit is not None and abs(np.log(abs(float(driven.ahead.gains[0])))) < np.log(_ALIKE):
             values = {"source": str(command.source), "unit": unit}
             line = f'unit = "{unit}"'
             case.correct("command", "unit as measured", values, line, {"unit": unit}, usual="rad/s")
-    elif wheels is None and command.reading.explained is not None and command.sign("ahead"):
+    elif not wheels.is_there and command.sign("ahead"):
         explained = command.reading.explained
         radius = case.vehicle.wheel_radius_m if case.is_known else None
         gain = float(explained.ahead.gains[0])
         correct_wheel_unit(case, command, gain, explained.shares[0], radius, "command")
 
 
-def _find_speed_units(case: Case, command: Candidate, wheels: Candidate) -> None:
-    """Correct or tell the units of a car's speeds: commanded, measured, and by the poses."""
+def _find_speed_units(case: Case) -> list[bool]:
+    """Correct or tell the units of a car's speeds, commanded and measured; whether each has any."""
+    command, wheels = case.command, case.wheels
     gains: list[float | None] = []
     shares, options = [], []
     for role, one in (("command", command), ("wheels", wheels)):
         made = one.reading.explained
-        seen = made is not None and one.sign("ahead")
-        gains.append(abs(float(made.ahead.gains[0])) if made is not None and seen else None)
-        shares.append(0.0 if made is None else made.shares[0])
+        gains.append(abs(float(made.ahead.gains[0])) if one.sign("ahead") else None)
+        shares.append(made.shares[0])
         is_given = getattr(case.configuration, role).unit is not None or one.source.signals[0].unit
         options.append(USUAL[:1] if is_given else (*SPEEDS,))
     names = (str(command.source), str(wheels.source))
     units = find_car_units(gains, shares, names, (options[0], options[1]))
+    is_scaled = []
     for index, (role, one) in enumerate((("command", command), ("wheels", wheels))):
         rival = None if units.rival is None else (units.rival[index], "")
-        _report_units(case, role, one, Units((units.likeliest[index], ""), rival), (gains[index],))
+        own = Units((units.likeliest[index], ""), rival)
+        is_scaled.append(_report_units(case, role, one, own, (gains[index],)))
+    return is_scaled
 
 
 _FASTEST = 1.3
@@ -183,9 +193,9 @@ scale, as of commands from -1 to 1."""
 
 def _report_units(
     case: Case, role: str, drive: Candidate, units: Units, gains: Sequence[float | None] = (None, None)
-) -> None:
-    """Correct units of a drive, or tell two readings that are as likely."""
-    section = getattr(case.configuration, role)
+) -> bool:
+    """Correct units of a drive, or tell two readings that are as likely; whether it has any unit."""
+    section, is_scaled = getattr(case.configuration, role), True
     turn_key, turn = (
         ("steering_unit", "steering angle") if drive.steering is units else ("yaw_unit", "yaw rate")
     )
@@ -195,12 +205,12 @@ def _report_units(
         if getattr(section, key) is not None or not unit:
             continue
         is_too_fast = key == "unit" and drive.reading.form == "body" and (gains[0] or 0.0) > _FASTEST
-        if unit in USUAL and is_too_fast and not (case.is_known and case.driven):
-            case.is_scaled = False
+        if unit in USUAL and is_too_fast and not (case.is_known and case.driven.is_known):
+            is_scaled = False
         if unit not in USUAL:
             speed, gain = units.likeliest[0], gains[0]
             is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
-            case.is_scaled = case.is_scaled and is_sure
+            is_scaled = is_scaled and is_sure
             values = {**of, "is_sure": bool(is_sure)}
             case.correct(role, "unit of a drive", values, f'{key} = "{unit}"', {key: unit}, usual="m/s")
         elif units.rival is not None and units.rival[index] != unit:
@@ -209,17 +219,19 @@ def _report_units(
             if gain is not None:
                 values["value"] = float(gain)
             case.findings.append(Finding("unit_undecided", "warning", role, values))
+    return is_scaled
 
 
-def _find_wheel_unit(case: Case, command: Candidate | None, wheels: Candidate) -> None:
+def _find_wheel_unit(case: Case) -> None:
     """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
+    command, wheels = case.command, case.wheels
     explained, share = wheels.reading.explained, 1.0
     radius, driven = case.vehicle.wheel_radius_m if case.is_known else None, case.driven
-    if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
+    if radius is not None and driven.sign("ahead") > 0:
         # Wheels follow a command closely on any ground.
         of_command = radius if command.reading.form == "sides" else case.command_factors()[0]
         gain = of_command / float(driven.ahead.gains[0])
-    elif explained is not None and wheels.is_sure and wheels.sign("ahead"):
+    elif wheels.sign("ahead"):
         gain, share = float(explained.ahead.gains[0]), explained.shares[0]
     else:
         return

@@ -37,7 +37,7 @@ from pipeline.core import (
     shorten,
     suffix_unit,
 )
-from pipeline.stages import Finding
+from pipeline.recording import Finding
 from pipeline.store import LOG_NOTES, Manifest, Store, date_runs
 
 if TYPE_CHECKING:

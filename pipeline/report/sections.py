@@ -17,6 +17,7 @@ from pipeline.core import (
     split_interval,
 )
 from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, name_term, suggest_manoeuvre
+from pipeline.recording import Finding
 from pipeline.report import (
     MISSING,
     Cell,
@@ -44,7 +45,6 @@ from pipeline.results import (
     read_findings,
     split_main,
 )
-from pipeline.stages import Finding
 from pipeline.words import (
     describe_cause,
     describe_motion,

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 from pipeline.core import JSON_DIGITS, format_share, mapping_in, number_in, objects_in, round_digits
-from pipeline.recording import FAULTS
+from pipeline.recording import FAULTS, Finding
 from pipeline.results.structs import Errors, RunDiagnosis, Step, round_numbers
 from pipeline.run import GROUND_UNOBSERVABLE
-from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     import polars as pl

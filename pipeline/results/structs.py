@@ -11,8 +11,8 @@ import msgspec
 from msgspec.structs import replace
 
 from pipeline.core import JSON_DIGITS, count_places, finite_or_none
+from pipeline.recording import Finding
 from pipeline.sources import Vehicle
-from pipeline.stages import Finding
 from pipeline.store import convert_stored
 
 Result = TypeVar("Result", bound=msgspec.Struct)

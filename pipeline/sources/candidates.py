@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Literal
@@ -230,6 +230,42 @@ _NO_HEADING = re.compile(r"rate|err|vel|speed|offset|acc|cov|std|gyro|init")
 _LEFT = re.compile(r"left|(?<![a-z])(?:l|fl|rl|bl|ml|lf|lr|lb|lm)(?![a-z])|(?<![a-z])l(?=wheel|motor)")
 _FORMS = {"sides": DriveForm.SIDES, "body": DriveForm.BODY, "steering": DriveForm.STEERING}
 
+RANKS: Mapping[str, tuple[float, str]] = {
+    # Commands and measured wheels: what the drive received, or measured, before what was derived of it.
+    "named_pair": (3.3, "a pair of topics by their names"),
+    "sides": (3.2, "left and right wheels"),
+    "steering": (3.2, "speed and steering angle"),
+    "speed_and_steering": (3.0, "speed and steering by their types"),
+    "speed_and_yaw_rate": (3.0, "speed and yaw rate by their types"),
+    "joints": (3.0, ""),
+    "fitting_pair": (3.0, "a pair of topics whose names fit the role"),
+    "ticks": (2.9, "left and right wheels"),
+    "neutral_pair": (2.5, "a pair of topics whose names do not say that they are measured"),
+    "pair_beside_command": (2.5, "a pair of topics beside one named as the command"),
+    "joints_of_a_car": (2.0, ""),
+    "measured_by_base": (2.0, "the body motion that the base measured by its wheels"),
+    "received": (2.0, "the body command that the controller received"),
+    "body": (1.5, "a body command"),
+    "upstream": (1.0, "a body command upstream of the controller"),
+    "wheel_odometry": (1.0, "the body motion of an odometry of the wheels"),
+    "measured_twist": (0.5, "a twist whose name says it is measured"),
+    # Poses: a localization before what may be one, and places before velocities.
+    "localization": (3.0, "a localization by its name"),
+    "transforms": (2.5, "the chain of transforms"),
+    "pose": (2.0, "a pose by its type"),
+    "fix": (1.2, "fixes of satellites"),
+    "ground_velocity": (1.1, "velocities over ground"),
+    "positions": (1.0, "positions by its type and name"),
+    "dead_reckoning": (0.5, "an odometry whose name says it comes from the wheels"),
+    # The gyro: the one that is usual on the vehicle, or has most messages.
+    "imu": (1.0, "an IMU by its type"),
+}
+"""Ranks of all that may fill a role by type and name, the higher the likelier, and the reason of each, empty
+where it names the type. The content decides later: `recording.pose_choice` among poses,
+`recording.roles` among commands."""
+_NEARER = 0.1
+"""Step of rank between topics that are alike but for their names."""
+
 Ranked = tuple[float, DriveSource]
 
 
@@ -310,7 +346,8 @@ class Topics:
             if known.joints is not None and is_command == commanded:
                 word = "contains command" if is_command else "does not contain command"
                 reason = f"{kind.rsplit('/', 1)[-1]} whose name {word}"
-                rank = (2.0 if steered else 3.0) - 0.1 * bool(known.joints.interfaces)
+                rank = RANKS["joints_of_a_car" if steered else "joints"][0]
+                rank -= _NEARER * bool(known.joints.interfaces)
                 yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), reason)
             drive = known.drive
             if (
@@ -337,23 +374,23 @@ class Topics:
             yield rank, DriveSource(_FORMS[drive.form], signals, reason, topic)
 
     def _rank_single(self, name: str, form: str, role: str, unit: str) -> tuple[float, str]:
+        is_nearer = bool(_EXECUTED.search(name))
         if role == "odometry":
-            return 1.0 + 0.1 * bool(_OF_WHEELS.search(name)), "the body motion of an odometry of the wheels"
-        if form != "body":
-            what = "speed and steering angle" if form == "steering" else "left and right wheels"
-            return 2.9 if unit == "ticks" else 3.2 + 0.1 * bool(_EXECUTED.search(name)), what
-        if role == "wheels":
-            return 2.0, "the body motion that the base measured by its wheels"
-        return self._rank_body(name)
-
-    def _rank_body(self, name: str) -> tuple[float, str]:
-        if MEASURED.search(name):
-            return 0.5, "a twist whose name says it is measured"
-        if _RECEIVED.search(name) and not _UPSTREAM.search(name):
-            return 2.0 + 0.1 * bool(_EXECUTED.search(name)), "the body command that the controller received"
-        if _UPSTREAM.search(name):
-            return 1.0, "a body command upstream of the controller"
-        return 1.5, "a body command"
+            key, is_nearer = "wheel_odometry", bool(_OF_WHEELS.search(name))
+        elif form != "body":
+            key = "ticks" if unit == "ticks" else form
+            is_nearer = is_nearer and key != "ticks"
+        elif role == "wheels":
+            key, is_nearer = "measured_by_base", False
+        elif MEASURED.search(name):
+            key, is_nearer = "measured_twist", False
+        elif _UPSTREAM.search(name):
+            key, is_nearer = "upstream", False
+        else:
+            key = "received" if _RECEIVED.search(name) else "body"
+            is_nearer = is_nearer and key == "received"
+        rank, reason = RANKS[key]
+        return rank + _NEARER * is_nearer, reason
 
     def _pairs_by_type(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
         """Speed and yaw rate, or speed and steering, if the types distinguish them."""
@@ -365,10 +402,8 @@ class Topics:
             by_quantity.get("speed", []), (("steering", DriveForm.STEERING), ("yaw_rate", DriveForm.BODY))
         ):
             for other in by_quantity.get(turn, []) if steered or form is DriveForm.BODY else []:
-                yield (
-                    3.0,
-                    DriveSource(form, (speed, other), f"speed and {turn.replace('_', ' ')} by their types"),
-                )
+                rank, reason = RANKS[f"speed_and_{turn}"]
+                yield rank, DriveSource(form, (speed, other), reason)
 
     def _pairs_by_table(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
         for pair in list_pairs():
@@ -381,7 +416,8 @@ class Topics:
                         Signal(topic, pair.first.field, pair.first.unit),
                         Signal(other, pair.second.field, pair.second.unit),
                     )
-                    yield 3.3, DriveSource(_FORMS[pair.form], signals, "a pair of topics by their names")
+                    rank, reason = RANKS["named_pair"]
+                    yield rank, DriveSource(_FORMS[pair.form], signals, reason)
 
     def pairs_of_sides(self) -> list[tuple[str, str]]:
         """Topics of one number whose names differ in left and right, or in fl and fr, rl and rr."""
@@ -416,7 +452,7 @@ def _signal(topic: str, number: NumberField) -> Signal:
 
 def _rank_pairs(
     pairs: Sequence[tuple[str, str]], *, commanded: bool
-) -> Iterable[tuple[float, tuple[str, str], str]]:
+) -> Iterator[tuple[float, tuple[str, str], str]]:
     """Pairs of topics that may fill a role, ranked by their names.
 
     A pair with a neutral name is a command, unless another pair is named as the command.
@@ -429,9 +465,8 @@ def _rank_pairs(
         name = pair[0].lower()
         if unwanted.search(name):
             continue
-        if wanted.search(name):
-            yield 3.0, pair, "a pair of topics whose names fit the role"
-        elif commanded and not command_is_named:
-            yield 2.5, pair, "a pair of topics whose names do not say that they are measured"
-        elif not commanded and command_is_named:
-            yield 2.5, pair, "a pair of topics beside one named as the command"
+        is_fitting = wanted.search(name) is not None
+        if is_fitting or commanded != command_is_named:
+            neutral = "neutral_pair" if commanded else "pair_beside_command"
+            rank, reason = RANKS["fitting_pair" if is_fitting else neutral]
+            yield rank, pair, reason

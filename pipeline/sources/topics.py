@@ -12,6 +12,7 @@ from pipeline.logs import TRANSFORM_TYPES, ChannelInfo, find_types, wanted_trans
 from pipeline.sources.candidates import (
     CONFIGURED,
     DEAD_RECKONED,
+    RANKS,
     DriveForm,
     DriveSource,
     PoseContent,
@@ -341,15 +342,15 @@ class _Chooser:
             for name in self.with_part("pose")
             if (ranked := self._rank_pose(name)) is not None
         ]
-        candidates += [
-            (1.2, self._by_satellites(name, "fixes of satellites")) for name in self.with_part("fix")
-        ]
-        candidates += [
-            (1.1, self._by_satellites(name, "velocities over ground"))
-            for name in self._own().ground_velocities()
-        ]
+        by_satellites = {
+            "fix": self.with_part("fix"), "ground_velocity": self._own().ground_velocities()
+        }  # fmt: skip
+        for key, names in by_satellites.items():
+            rank, reason = RANKS[key]
+            candidates += [(rank, self._by_satellites(name, reason)) for name in names]
         if transforms:
-            candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
+            rank, reason = RANKS["transforms"]
+            candidates.append((rank, PoseSource(transforms, reason, from_transforms=True)))
         return self._best(candidates, self.vehicle.topics.pose, "pose")
 
     def _pose_of_fields(self, section: PoseSection) -> PoseSource:
@@ -398,16 +399,18 @@ class _Chooser:
         name = topic.lower()
         if _NOT_A_POSE.search(name):
             return None
-        pose = find_type(self.types[topic]).pose
+        pose, key = find_type(self.types[topic]).pose, "pose"
+        headings: tuple[Signal, ...] = ()
         if pose is not None and not (pose.orientation or pose.angle):
-            is_position = is_localization(name) or _PLACE.search(name)
-            made = PoseSource(topic, "positions by its type and name", headings=self._own().headings())
-            return (1.0, made) if is_position else None
-        if is_localization(name):
-            return 3.0, PoseSource(topic, "a localization by its name")
-        if DEAD_RECKONED.search(name):
-            return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
-        return 2.0, PoseSource(topic, "a pose by its type")
+            if not (is_localization(name) or _PLACE.search(name)):
+                return None
+            key, headings = "positions", self._own().headings()
+        elif is_localization(name):
+            key = "localization"
+        elif DEAD_RECKONED.search(name):
+            key = "dead_reckoning"
+        rank, reason = RANKS[key]
+        return rank, PoseSource(topic, reason, headings=headings)
 
     def choose_imu(self, topic: str | None) -> TopicSource | None:
         """The gyro: configured, else the usual one, else the one with most messages."""
@@ -416,7 +419,8 @@ class _Chooser:
             if find_type(self.types[name]).imu is None:
                 raise self._unusable(name, "imu", " or ".join(list_types("imu")))
             return TopicSource(name, CONFIGURED)
-        candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.with_part("imu")]
+        rank, reason = RANKS["imu"]
+        candidates = [(rank, TopicSource(name, reason)) for name in self.with_part("imu")]
         return self._best(candidates, self.vehicle.topics.imu, "imu")
 
     def choose_interval(self, configuration: Configuration) -> TopicSource | None:

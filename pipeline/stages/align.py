@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, robust_spread
+from pipeline.recording import ONE_SCALE, SIGNALS, Finding, check_echo, find_steady_gain, interpolate_readings
 from pipeline.run import (
     ANSWERS_S,
     SPAN_S,
@@ -29,13 +30,10 @@ from pipeline.run import (
     tabulate_alignment,
 )
 from pipeline.sources import Vehicle, VelocitySection
-from pipeline.stages.drive import SIGNALS, interpolate_readings
 from pipeline.stages.drive_numbers import mark_late_starts
-from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import interpolate_wheels, usual_hold
-from pipeline.stages.pose_choice import find_steady_gain
 from pipeline.stages.timing import estimate_latency
-from pipeline.stages.trust import LEAST_CORRELATION, ONE_SCALE, check_echo, estimate_delay
+from pipeline.stages.trust import LEAST_CORRELATION, estimate_delay
 from pipeline.stages.velocity import smooth_gyro
 
 _LEAST_S = 0.05

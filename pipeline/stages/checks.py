@@ -8,14 +8,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Flags, Floats, Ints, fit_robustly, robust_spread
+from pipeline.recording import ONE_SCALE, SURE, Finding
 from pipeline.run import LIVE_SHARE, STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
-from pipeline.stages.findings import SURE, Finding
 from pipeline.stages.slip_stage import SlipResult
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
     LEAST_CORRELATION,
-    ONE_SCALE,
     Samples,
     check_independence,
     check_live_commands,

@@ -17,8 +17,8 @@ from pipeline.core import (
     rigid,
     robust_spread,
 )
+from pipeline.recording import Finding
 from pipeline.sources import Vehicle
-from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import hold_commands, interpolate_wheels
 
 # A drive that was stopped or released may follow its next command late, by a different delay each time: a

@@ -10,9 +10,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import Flags, Floats, arrays
+from pipeline.recording import number_gaps
 from pipeline.run import STILL_MPS, read_wheel_times
 from pipeline.sources import Vehicle
-from pipeline.stages.lost_messages import number_gaps
 
 _SHARE_OF_RANGE = 0.02
 """Fraction of a command's range that counts as a change: joysticks and path followers vary by less."""

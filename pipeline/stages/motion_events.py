@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Flags, Floats, arrays
+from pipeline.recording import Finding
 from pipeline.run import (
     ANSWERS_S,
     Limits,
@@ -15,7 +16,6 @@ from pipeline.run import (
     trace_traction,
 )
 from pipeline.sources import Vehicle
-from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import LIVE, USUAL_S, Rims, Span, Spans, gather_rims, mark_excluded
 from schemas import tabulate

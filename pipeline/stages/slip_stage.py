@@ -8,8 +8,8 @@ import polars as pl
 import polars.selectors as cs
 
 from pipeline.core import Flags, Floats
+from pipeline.recording import Finding, StageError
 from pipeline.sources import Configuration, Vehicle
-from pipeline.stages.findings import Finding, StageError
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
 from pipeline.stages.motion_events import MotionEvents, find_events
 from pipeline.stages.spans import find_spans

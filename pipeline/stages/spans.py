@@ -26,9 +26,9 @@ from pipeline.core import (
     recur,
     weigh,
 )
+from pipeline.recording import BLOCK_S, LASTS_NATS, Finding, follow_likeliest, price_change
 from pipeline.run import ANSWERS_S, LIVE_SHARE, STILL_MPS
 from pipeline.sources import Vehicle
-from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal
 
 Kind = Literal[
@@ -48,18 +48,12 @@ _INCIDENTS = {
 """Kinds of spans that are no fault of the poses."""
 _BAD_POSES = ("rotated", "lost")
 
-BLOCK_S = 0.5
-"""Length of a block [s]: an end of a span is known to within one."""
-LEVEL = 0.001
-"""Probability that a run of normal driving has a span."""
 LIVE = 0.25
 """Fraction of the usual largest speed above which a command is live: it overcomes friction."""
 _SAME = 0.03
 """Fraction of the usual largest speed below which a difference is no contradiction."""
-_LASTS_NATS = 0.1
-"""Price of every block of a span [nats], so that it ends with the last block that shows it."""
-_ENDS_NATS = -math.log(1.0 - math.exp(-_LASTS_NATS))
-"""Price of the end of a span [nats], with which its length has the probability that `_LASTS_NATS` means.
+_ENDS_NATS = -math.log(1.0 - math.exp(-LASTS_NATS))
+"""Price of the end of a span [nats], with which its length has the probability that `LASTS_NATS` means.
 
 While the source drives, what a fit does not know lasts, too: there the end costs as much as the start.
 """
@@ -221,37 +215,6 @@ def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
     seconds = {kind: sum(one.end - one.start for one in bad if one.kind == kind) for kind in _BAD_POSES}
     values = {"value": share, "count": len(bad), "seconds": seconds}
     return Finding("bad_stretch", "warning", "pose", values, t_start=bad[0].start)
-
-
-def price_change(count: int) -> float:
-    """Log-likelihood that a change of the hypothesis costs: any of so many blocks might have one."""
-    return float(np.log(count / LEVEL))
-
-
-def follow_likeliest(gains: Floats, price: float, ends: float | None = None) -> list[tuple[int, slice]]:
-    """Likeliest spans of other hypotheses, with their numbers (Viterbi).
-
-    Args:
-        gains: log-likelihood of other hypotheses less that of the usual one, shape (m, k).
-        price: of a change [nats]; see `price_change`.
-        ends: price of the change back to the usual one, if it is another.
-    """
-    gains = np.column_stack((np.zeros(len(gains)), gains - _LASTS_NATS))
-    change = price * (1.0 - np.eye(gains.shape[1]))
-    change[1:, 0] = price if ends is None else ends
-    # A recording may begin and end at any time.
-    score, origin = np.zeros(gains.shape[1]), np.zeros(gains.shape, dtype=np.int64)
-    for k, gain in enumerate(gains):
-        routes = score[:, None] - change
-        origin[k] = routes.argmax(axis=0)
-        score = routes.max(axis=0) + gain
-    states = np.zeros(len(gains), dtype=np.int64)
-    state = int(score.argmax())
-    for k in range(len(gains) - 1, -1, -1):
-        states[k], state = state, int(origin[k, state])
-    return [
-        (which - 1, slice(*one)) for which in range(1, gains.shape[1]) for one in find_runs(states == which)
-    ]
 
 
 class _Blocks:

@@ -12,9 +12,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, rigid, student_quantile
+from pipeline.recording import Finding, measure_rest
 from pipeline.run import ANSWERS_S, LIVE_SHARE, MOVING_MPS, SPAN_S, STILL_MPS
 from pipeline.sources import Vehicle
-from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal, Steps
 
 _STEP = 0.02
@@ -24,9 +24,6 @@ _FEWEST_OF_DELAY = 50
 FEWEST_SAMPLES = 100
 """Least number of grid samples for any check: five seconds at 20 Hz. Half and double change no finding of
 two recordings."""
-ONE_SCALE = 0.2
-"""Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
-not."""
 LEAST_CORRELATION = 0.7
 """Correlation below which a lag is meaningless: at this value the signals share half of their power."""
 
@@ -279,78 +276,6 @@ def _share_beside_wheels(
         driven = arrays.integrate_rate(samples.times, rate)
         shares.append(measure_rest(moved, driven[last] - driven[first], rate[last] - rate[first]))
     return shares[0], shares[1], shares[2]
-
-
-def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:
-    """Median residual of a robust fit of ``moved`` on ``driven`` and ``changed``, relative to ``moved``."""
-    size = float(np.sqrt(np.mean(moved**2)))
-    if size < STILL_MPS * SPAN_S:
-        return None
-    _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
-    return float(np.median(np.abs(rest))) / size
-
-
-_RECENT_S = 0.5
-"""Age [s] up to which a command may be what the wheels repeat: the usual timeout of a controller."""
-_EXACTLY = 1e-5
-"""Relative difference of numbers that are equal up to the precision of a message."""
-_FEWEST_CHANGES = 50
-"""Least number of changes of the wheels' reading for a judgment: one or two seconds of driving."""
-_REPEATED = 0.9
-"""Fraction of the changes of the wheels' reading that are recent commands, above which nothing was measured:
-1 in open loop, at most 0.04 of the recordings' encoders and 0.02 of exact ones behind a lag of 20 ms."""
-
-
-def check_echo(
-    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, *, body_commanded: bool
-) -> list[Finding]:
-    """Report measured wheels that repeat the commands: a controller in open loop says what it was asked for.
-
-    Encoders have steps and noise, and even a fast drive passes through speeds that were never commanded.
-
-    Args:
-        commands: table `commands` as extracted.
-        wheels: table `wheels` as extracted.
-        vehicle: its vehicle.
-        body_commanded: whether the command was a body command.
-    """
-    if min(commands.height, wheels.height) < _FEWEST_CHANGES:
-        return []
-    kinematics = vehicle.kinematics
-    names = [one.name for one in kinematics.inputs]
-    commands, wheels = (_keep_readings(table, names) for table in (commands, wheels))
-    if min(commands.height, wheels.height) < _FEWEST_CHANGES:
-        return []
-    asked, read = (
-        # An input that no message has is none, as sideways speeds of wheels are.
-        np.nan_to_num(np.stack(roll({name: table[name].to_numpy() for name in names}, vehicle), axis=-1))
-        for table, roll in (
-            (commands, kinematics.asked if body_commanded else kinematics.forward),
-            (wheels, kinematics.forward),
-        )
-    )
-    equal = _EXACTLY * np.abs(asked).max(axis=0)
-    changed = 1 + np.flatnonzero((np.abs(np.diff(read, axis=0)) > equal).any(axis=1))
-    if changed.size < _FEWEST_CHANGES:
-        return []
-    stamps = commands["t"].to_numpy()
-    last = arrays.hold_indices(wheels["t"].to_numpy()[changed], stamps)
-    repeats = np.zeros(changed.size, dtype=bool)
-    # The clocks of two topics differ: the command may be recorded just after what repeats it.
-    for back in range(-2, arrays.count_steps(stamps, _RECENT_S)):
-        command = asked[np.clip(last - back, 0, stamps.size - 1)]
-        repeats |= (np.abs(read[changed] - command) <= equal).all(axis=1)
-    share = float(repeats.mean())
-    if share < _REPEATED:
-        return []
-    return [Finding("wheels_from_commands", "warning", "wheels", {"value": share})]
-
-
-def _keep_readings(table: pl.DataFrame, names: Sequence[str]) -> pl.DataFrame:
-    """Rows in which every input is known that any row has."""
-    known = table.select(pl.col(names).cast(pl.Float64).is_finite().fill_null(value=False))
-    rows = [known[name] for name in names if known[name].any()]
-    return table.filter(pl.all_horizontal(rows)) if rows else table.clear()
 
 
 def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

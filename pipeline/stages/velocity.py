@@ -13,6 +13,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import Floats, arrays, rigid
+from pipeline.recording import Finding, StageError
 from pipeline.run import (
     SPAN_S,
     Alignment,
@@ -21,7 +22,6 @@ from pipeline.run import (
     select_fresh,
 )
 from pipeline.sources import VelocitySection
-from pipeline.stages.findings import Finding, StageError
 
 _LEAST_TURNING_RADPS = 0.03
 """Standard deviation of the yaw rate below which an unused gyro cannot be judged, so that no disagreement is

@@ -16,6 +16,7 @@ from pipeline.core import (
     suffix_unit,
 )
 from pipeline.models import Excitation, list_effects, name_term
+from pipeline.recording import Finding, Severity
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
@@ -40,7 +41,6 @@ from pipeline.results import (
     split_main,
 )
 from pipeline.run import HORIZON_S
-from pipeline.stages import Finding, Severity
 from pipeline.words.effects import (
     describe_cause,
     describe_motion,

@@ -15,7 +15,7 @@ from pipeline.core import (
     name_first,
     suffix_unit,
 )
-from pipeline.stages import Finding
+from pipeline.recording import Finding
 
 Values = Mapping[str, Any]
 """The values of a finding, and ``where`` it is."""

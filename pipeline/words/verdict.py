@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 
 from pipeline.core import enumerate_texts, format_share
+from pipeline.recording import Finding
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
@@ -20,7 +21,6 @@ from pipeline.results import (
     rank_main,
 )
 from pipeline.run import HORIZON_S
-from pipeline.stages import Finding
 from pipeline.words.effects import describe_clause, list_names, name_group
 from pipeline.words.errors import format_excess, format_step
 from pipeline.words.findings import format_finding

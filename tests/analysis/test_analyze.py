@@ -11,8 +11,8 @@ from stored import hash_tree
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log, update_datasets
 from pipeline.core import SlipError
+from pipeline.recording import StageError
 from pipeline.simulate import simulate_case
-from pipeline.stages import StageError
 from pipeline.store import Store
 
 STAGES = ("extract", "velocity", "slip", "aggregate")

@@ -10,11 +10,10 @@ from mcap.writer import Writer
 
 from pipeline.analysis import Options
 from pipeline.logs.writer import LogWriter
-from pipeline.recording import log_choice
+from pipeline.recording import log_choice, pose_choice
 from pipeline.recording.inspection import inspect_log
 from pipeline.recording.log_choice import MOST_POSES
 from pipeline.simulate import simulate_case
-from pipeline.stages import pose_choice
 from pipeline.words import format_finding
 
 FEW = 150

@@ -11,9 +11,9 @@ from few import few
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core.arrays import Floats
+from pipeline.recording.drive import differentiate_angle
+from pipeline.recording.pose_choice import integrate_between
 from pipeline.simulate import Encoders, Recording, make_scenario, simulate_run, write_log
-from pipeline.stages.drive import differentiate_angle
-from pipeline.stages.pose_choice import integrate_between
 
 
 def fall_silent(time: Floats) -> Floats:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core import arrays
-from pipeline.stages.drive import interpolate_repeats
+from pipeline.recording.drive import interpolate_repeats
 from pipeline.stages.velocity import make_grid
 
 WINDOW_S = 0.75

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from report_synthesis import make_report
 
 from pipeline.models import find_effect, list_effects
-from pipeline.recording import FAULTS
+from pipeline.recording import FAULTS, Finding
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
 from pipeline.results import (
@@ -28,7 +28,6 @@ from pipeline.results import (
     Value,
 )
 from pipeline.sources import list_presets
-from pipeline.stages import Finding
 from pipeline.words.diagnosis import list_lines
 from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import format_verdict

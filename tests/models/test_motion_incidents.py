@@ -17,6 +17,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.rigid import find_runs
 from pipeline.estimation import EstimationData, Input, estimate_intervals, fit_model
 from pipeline.models import Model, find_effect
+from pipeline.recording import Finding
 from pipeline.run import load_run
 from pipeline.simulate import (
     Disturbance,
@@ -28,7 +29,6 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate.scenario import Commands
-from pipeline.stages import Finding
 from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import find_spans
 from pipeline.words import format_finding

@@ -9,9 +9,9 @@ from drawn_motion import LAG, Drive, draw
 from written_logs import write_log
 
 from pipeline.analysis import Options
+from pipeline.recording import Finding
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.readings import Held
-from pipeline.stages import Finding
 from pipeline.words import format_finding
 
 

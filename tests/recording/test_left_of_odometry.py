@@ -22,7 +22,9 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import Flags, Floats
 from pipeline.recording.log_setup import LogSetup, set_up_log
+from pipeline.recording.motion import NO_MOTION
 from pipeline.recording.outages import find_outages
+from pipeline.recording.readings import Reading
 from pipeline.words import format_finding
 
 SECONDS = 90.0
@@ -120,9 +122,7 @@ def test_a_copy_of_wheel_odometry_is_found_though_of_each_other_messages_are_lef
 
 def test_of_wheels_beside_which_nothing_is_left_no_outage_is_said() -> None:
     made = sides(draw(2))
-    assert made.first is not None
-    assert made.second is not None
-    assert find_outages({"left": made.first, "right": made.second}, (0.0, 0.0), None, None) == []
+    assert find_outages({"left": made.first, "right": made.second}, (0.0, 0.0), Reading(), NO_MOTION) == []
 
 
 def test_a_flipped_bit_does_not_make_wheel_odometry_a_pose(foreign_logs: Path, tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from drawn_drives import DrawnDrive, DrawnTopic, record_cdr, record_twist, stamp
 
 from pipeline.analysis import Options
 from pipeline.core import Flags, Floats
+from pipeline.recording import number_gaps
 from pipeline.recording.log_setup import LogSetup, set_up_log
-from pipeline.stages import number_gaps
 from pipeline.words import format_finding
 
 STEP_S = 0.01

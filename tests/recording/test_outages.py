@@ -17,6 +17,7 @@ from written_logs import write_log
 from pipeline.analysis import Options
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.log_setup import set_up_log
+from pipeline.recording.motion import NO_MOTION
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
 from pipeline.words import format_finding
@@ -39,13 +40,11 @@ def kill(side: Held, kind: str, end: float = np.inf, start: float = DIES) -> Hel
 
 def look(drive: Drive, wheels: Reading, *, asked: bool = True, seen: bool = True) -> list[Outage]:
     """Outages of a drive's wheels by its command and its poses."""
-    motion = measured(tabulate(drive)) if seen else None
-    one = command(drive)
-    rolled = motion or roll_wheels(sides(drive))
-    assert rolled is not None
-    one.explain(rolled)
+    motion = measured(tabulate(drive)) if seen else NO_MOTION
+    one = command(drive).fitted(motion if seen else roll_wheels(sides(drive)))
+    assert one.explained.is_known
     pair = dict(zip(SIDES, (wheels.first, wheels.second), strict=True))
-    return find_outages({k: v for k, v in pair.items() if v}, (0.0, 0.0), one if asked else None, motion)
+    return find_outages(pair, (0.0, 0.0), one if asked else Reading(), motion)
 
 
 READS = {"zero": "zero", "held": "one value", "noise": "noise", "silent": "nothing"}

@@ -27,7 +27,7 @@ def send(starts: Floats, speeds: Floats, zeros: int | Floats = 0) -> tuple[Float
 def find(stamps: Floats, values: Floats, time: Floats, speed: Floats) -> CommandTimeout | None:
     wheels = Reading("body", "", Held(time, speed), Held(time, 1e-3 * np.sin(time)))
     motion = roll_wheels(wheels)
-    assert motion is not None
+    assert motion.is_known
     return find_timeout(Reading("body", "", Held(stamps, values), Held(stamps, 0.0 * values)), motion, 0.5)
 
 
@@ -109,7 +109,7 @@ def test_a_base_that_waits_less_than_its_commander_drives_in_bursts(
         speed[row] = state
         state += (one - state) * STEP_S / 0.2
     motion = roll_wheels(Reading("body", "", Held(time, speed), Held(time, 1e-3 * np.sin(time))))
-    assert motion is not None
+    assert motion.is_known
     command = Reading("body", "", Held(stamps, values, may_stand=True), Held(stamps, 0.0 * values))
     found = find_hold(command, motion)
     if np.isinf(timeout_s):

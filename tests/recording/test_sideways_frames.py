@@ -57,8 +57,7 @@ def read(time: Floats, asked: Complex, rate: Floats) -> Reading:
 def test_the_angle_of_the_heading_is_found(degrees: float, *, line: bool) -> None:
     time, asked, rate, place, yaw = drive(3, line=line)
     motion = see(place, yaw - np.radians(degrees))
-    command = read(time, asked, rate)
-    command.explain(motion)
+    command = read(time, asked, rate).fitted(motion)
     assert command.explained.is_sure
     turned, margin, _ = find_frame(motion, [command])
     assert not turned.flip
@@ -81,8 +80,7 @@ def test_the_hand_and_the_rear_of_a_frame_are_told_by_signs(
 ) -> None:
     time, asked, rate, place, yaw = drive(4)
     motion = see(*change(place, yaw))
-    command = read(time, asked, rate)
-    command.explain(motion)
+    command = read(time, asked, rate).fitted(motion)
     turned, _, _ = find_frame(motion, [command])
     assert (turned.flip, turned.offset_deg) == (flip, 0.0)
     made = command.explain(turned)
@@ -93,8 +91,7 @@ def test_a_command_that_is_the_same_throughout_says_where_the_body_should_go() -
     time, _, rate, place, yaw = drive(5, line=True)
     driven = (time > 3.0) & (time < 50.0)
     asked = np.full(int(driven.sum()), 0.3 * np.exp(0.6j))
-    command = read(time[driven], asked, 0.0 * rate[driven])
-    command.explain(see(place, yaw - 0.5 * np.pi))
+    command = read(time[driven], asked, 0.0 * rate[driven]).fitted(see(place, yaw - 0.5 * np.pi))
     assert command.is_constant
     assert command.explained.is_sure
 
@@ -106,6 +103,5 @@ def test_commands_along_the_axes_of_a_map_are_told_from_those_of_the_body(*, of_
     turned = np.cumsum(0.9 * rate) * STEP
     place = np.cumsum(0.8 * asked * (1.0 if of_map else np.exp(1j * turned))) * STEP
     noise = np.random.default_rng(6).normal(0.0, 0.002, (2, yaw.size))
-    command = read(time, asked, rate)
-    command.explain(see(place[::10] + noise[0] + 1j * noise[1], yaw))
+    command = read(time, asked, rate).fitted(see(place[::10] + noise[0] + 1j * noise[1], yaw))
     assert (rate_map_axes(command) > CLEAR) == of_map

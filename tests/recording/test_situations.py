@@ -88,7 +88,7 @@ def turns_before_a_gear(path: Path, drive: Drive) -> Path:
 def four_wheels(drive: Drive, factors: tuple[float, float, float, float]) -> dict[str, Held]:
     """Front left and right, rear left and right."""
     read = sides(drive)
-    pair = [one for one in (read.first, read.second) if one is not None]
+    pair = [read.first, read.second]
     names = [f"{end}_{side}_wheel" for end in ("front", "rear") for side in ("left", "right")]
     each = zip(names, pair * 2, factors, strict=True)
     return {name: Held(one.times, factor * one.values) for name, one, factor in each}

@@ -10,6 +10,7 @@ import pytest
 from drawn_diagnoses import draw_diagnosis
 
 from pipeline.core import SlipError
+from pipeline.recording import Finding
 from pipeline.results import (
     DataNeed,
     Growth,
@@ -30,7 +31,6 @@ from pipeline.results.reading import (
     read_findings,
     read_model,
 )
-from pipeline.stages import Finding
 from pipeline.words import format_finding
 from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import format_verdict

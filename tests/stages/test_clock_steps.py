@@ -18,10 +18,10 @@ from stage_logs import FIELD, Taken, TakeThrough, keep_good_rows, record
 
 from pipeline.analysis.work import as_recorded
 from pipeline.estimation import Recording, diagnose_runs
+from pipeline.recording.clocks import Recorded, align_clocks
 from pipeline.run import Alignment, read_drive
 from pipeline.simulate import Clock, Scenario
 from pipeline.stages.align import align_tables
-from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.slip_stage import compute_slip
 from pipeline.stages.velocity import compute_velocities
 

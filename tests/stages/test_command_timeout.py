@@ -98,5 +98,5 @@ def find_among(taken: Taken, *lost: str) -> CommandTimeout | None:
         )
         readings.append(Reading("body", "", *(Held(times, velocity[:, axis]) for axis in (0, 2))))
     motion = roll_wheels(readings[1])
-    assert motion is not None
+    assert motion.is_known
     return find_timeout(readings[0], motion, 0.5)

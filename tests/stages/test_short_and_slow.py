@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from stage_logs import make_samples
 
+from pipeline.recording.clocks import Recorded, align_clocks
+from pipeline.recording.satellite import Turning, find_heading, follow_velocity
 from pipeline.run import Alignment
 from pipeline.sources import find_preset
 from pipeline.stages.checks import check_delays, check_motion, check_scale
-from pipeline.stages.clocks import Recorded, align_clocks
-from pipeline.stages.satellite import Turning, find_heading, follow_velocity
 from pipeline.stages.velocity import report_gyro
 from pipeline.words import format_finding
 

@@ -13,7 +13,19 @@ from stage_logs import FIELD, PLAIN, TakeThrough
 from pipeline.core import rigid
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
+from pipeline.recording.clocks import Recorded, align_clocks
+from pipeline.recording.drive import read_joints, unwrap_counter
+from pipeline.recording.extract import Given, extract_tables
 from pipeline.recording.log_choice import Choice, choose
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.topic_values import (
+    PoseArrays,
+    find_angle_unit,
+    find_lean,
+    list_wanted,
+    put_upright,
+    read_pose_topic,
+)
 from pipeline.simulate import PoseSensor, Recording, Scenario, make_scenario, simulate_run, write_log
 from pipeline.sources import (
     Configuration,
@@ -22,17 +34,6 @@ from pipeline.sources import (
     find_preset,
     find_type,
     load_configuration,
-)
-from pipeline.stages.clocks import Recorded, align_clocks
-from pipeline.stages.drive import read_joints, unwrap_counter
-from pipeline.stages.extract import Given, extract_tables
-from pipeline.stages.reading import (
-    PoseArrays,
-    find_angle_unit,
-    find_lean,
-    list_wanted,
-    put_upright,
-    read_pose_topic,
 )
 from pipeline.words import format_finding
 
@@ -262,7 +263,9 @@ def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
     chosen = choose(index, Configuration(), {})
     types = {channel.topic: channel.type_name for channel in index.channels}
     data = read_topics(index, list_wanted(chosen.sources, types))
-    made = extract_tables(Given(data, chosen.sources, Configuration(), chosen.vehicle, "run.mcap"))
+    made = extract_tables(
+        Given(LogColumns(data), chosen.sources, Configuration(), chosen.vehicle, "run.mcap")
+    )
     (finding,) = [found for found in made.findings if found.id == "sideways_command"]
     assert finding.severity == "error"
     assert "Husky A200 (differential) cannot do" in format_finding(finding)

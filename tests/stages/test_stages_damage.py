@@ -13,8 +13,8 @@ from pipeline.core import SlipError
 from pipeline.logs import Loss, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.logs.writer import LogWriter
+from pipeline.recording import blame_damage
 from pipeline.simulate import Recording
-from pipeline.stages import blame_damage
 
 CHUNK, DATA_END = 6, 15
 ABSURD = (np.inf, -np.inf, np.nan, 1e308, -1e308, 5e-324, 1e200)

@@ -10,12 +10,7 @@ from simulated_platforms import fix, ground_velocity, to_earth
 from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
-from pipeline.simulate import Imu, Layout, PoseSensor, Scenario
-from pipeline.simulate.facts import Published
-from pipeline.simulate.messages import imu, joints, twist
-from pipeline.sources.candidates import Topics
-from pipeline.stages.reading import Receiver
-from pipeline.stages.satellite import (
+from pipeline.recording.satellite import (
     Turning,
     follow_closely,
     follow_track,
@@ -25,6 +20,11 @@ from pipeline.stages.satellite import (
     read_over_ground,
     to_local_plane,
 )
+from pipeline.recording.topic_values import Receiver
+from pipeline.simulate import Imu, Layout, PoseSensor, Scenario
+from pipeline.simulate.facts import Published
+from pipeline.simulate.messages import imu, joints, twist
+from pipeline.sources.candidates import Topics
 from pipeline.words import format_finding
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")

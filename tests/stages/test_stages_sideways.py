@@ -6,8 +6,8 @@ import polars as pl
 import pytest
 from stage_logs import EXACT, PLAIN, TakeThrough, rms
 
+from pipeline.recording import StageError
 from pipeline.simulate import VEHICLES, PoseSensor
-from pipeline.stages import StageError
 from pipeline.words import format_finding
 
 FINE = replace(EXACT, noise_m=0.002, noise_rad=0.001)

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from stage_logs import EXACT, FIELD, PLAIN, TakeThrough, rms
 
 from pipeline.analysis.work import as_recorded
+from pipeline.recording.clocks import Recorded, align_clocks
 from pipeline.run import Alignment
 from pipeline.simulate import Clock, Encoders, Imu, Program, Recording, Scenario
 from pipeline.stages.align import align_tables
-from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.trust import estimate_delay
 
 SECOND = 10**9

@@ -9,9 +9,9 @@ from stage_logs import FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import SlipError
 from pipeline.recording.command_scale import find_ratio
+from pipeline.recording.drive import _mean_steering
 from pipeline.run import read_drive
 from pipeline.simulate import VEHICLES, Encoders, PoseSensor, Program, Recording
-from pipeline.stages.drive import _mean_steering
 from pipeline.words import format_finding
 
 LONGER = replace(FIELD, duration_s=150.0)

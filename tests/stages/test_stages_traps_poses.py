@@ -9,11 +9,11 @@ import pytest
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import rigid
+from pipeline.recording.pose_topics import cut_track
 from pipeline.run import Alignment, Track
 from pipeline.run.signals import DriveSeries
 from pipeline.simulate import VEHICLES, Ground, Program, Recording
 from pipeline.sources import Configuration
-from pipeline.stages.pose_topics import cut_track
 from pipeline.stages.timing import _take_off
 from pipeline.stages.velocity import compute_velocities
 from pipeline.words import format_finding

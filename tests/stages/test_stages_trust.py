@@ -7,8 +7,9 @@ import pytest
 from scipy.signal import lfilter
 from stage_logs import make_samples
 
+from pipeline.recording.echo import check_echo
 from pipeline.sources import find_preset
-from pipeline.stages.trust import Samples, check_echo, check_independence
+from pipeline.stages.trust import Samples, check_independence
 
 PERIODS_S = (0.05, 0.1)
 

@@ -12,9 +12,9 @@ from pipeline.core import SlipError
 from pipeline.logs import columns, index, schema
 from pipeline.logs import schema as idl
 from pipeline.models.parameter import parse_unit
+from pipeline.recording import drive, pose_choice
 from pipeline.sources import Signal, candidates, read_description
 from pipeline.sources import layers as sources
-from pipeline.stages import drive, pose_choice
 from pipeline.web.cards import make_formula
 from pipeline.web.jobs import clean_name
 

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.models import Late, find_late_effect
+from pipeline.recording import Finding
 from pipeline.recording.readings import SIDES
-from pipeline.stages import Finding, motion_events, spans
+from pipeline.stages import motion_events, spans
 from pipeline.words import findings as words
 from pipeline.words import format_finding
 from pipeline.words.findings import FAULTS, TEMPLATES, Template, fill_template

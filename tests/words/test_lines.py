@@ -6,6 +6,7 @@ from msgspec.structs import replace
 
 from pipeline.core import format_length
 from pipeline.models import name_term
+from pipeline.recording import Finding
 from pipeline.results import (
     DataNeed,
     Named,
@@ -14,7 +15,6 @@ from pipeline.results import (
     Unexplained,
     Value,
 )
-from pipeline.stages import Finding
 from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import Flags, Floats, Ints, arrays, rigid
+from pipeline.recording import topic_values
+from pipeline.recording.findings import Finding
+from pipeline.recording.topic_values import FEWEST_MESSAGES, Located, PoseArrays, Receiver
 from pipeline.run import MOVING_MPS, STILL_MPS, fit_turning
 from pipeline.sources import find_type
-from pipeline.stages import reading
-from pipeline.stages.findings import Finding
-from pipeline.stages.reading import FEWEST_MESSAGES, Located, PoseArrays, Receiver
 
 # Heading of a vehicle from its course over ground, and possibly from a sensor that turns with it.
 #
@@ -171,7 +171,7 @@ def read_over_ground(times: Floats, position: Floats, clock: Floats, velocity: F
         velocity: as published [m/s], shape (m, 2).
     """
     inside = (clock > times[0]) & (clock < times[-1])
-    if inside.sum() < reading.FEWEST_MESSAGES:
+    if inside.sum() < topic_values.FEWEST_MESSAGES:
         return None
     moved = arrays.differentiate_locally(clock[inside], times, position[:, :2], _WINDOW_S)
     size = float(np.sqrt(np.mean(moved**2)))
@@ -234,7 +234,7 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
     start, end = course.times[first], course.times[first + steps]
     inside = (start > turning.times[0]) & (end < turning.times[-1]) & (end - start < 2.0 * _WINDOW_S)
     first, start, end = first[inside], start[inside], end[inside]
-    if first.size < reading.FEWEST_MESSAGES:
+    if first.size < topic_values.FEWEST_MESSAGES:
         return None
     turned = rigid.wrap_angle(angle[first + steps] - angle[first])
     size = float(np.sqrt(np.mean(turned**2)))
@@ -363,7 +363,7 @@ def locate_vehicle(
     topic = receiver.columns.topic
     track = _read_track(receiver)
     findings = list(track.findings)
-    if track.rows.size < reading.FEWEST_MESSAGES:
+    if track.rows.size < topic_values.FEWEST_MESSAGES:
         nothing = PoseArrays(np.zeros((0, 3)), np.zeros((0, 4)), _PARENT, _CHILD)
         return Located(track.rows[:0], nothing, track.findings)
     times, follow_alone = receiver.times[track.rows], None
@@ -403,12 +403,12 @@ def _read_track(receiver: Receiver) -> _Track:
     """Fixes on a local plane, or integrated velocities over ground."""
     columns, rows = receiver.columns, receiver.order
     if find_type(columns.type_name).fix is None:
-        velocity = reading.read_ground_velocity(columns)[rows]
+        velocity = topic_values.read_ground_velocity(columns)[rows]
         known = np.isfinite(velocity).all(axis=1)
         rows, velocity = rows[known], velocity[known]
         ways = [arrays.integrate_rate(receiver.times[rows], velocity[:, axis]) for axis in (0, 1)]
         return _Track(rows, np.stack((*ways, np.zeros(rows.size)), axis=-1), velocity)
-    latitude, longitude, altitude, fixed = reading.read_fixes(columns)
+    latitude, longitude, altitude, fixed = topic_values.read_fixes(columns)
     good = rows[fixed[rows]]
     position = to_local_plane(latitude[good], longitude[good], altitude[good])
     lost = rows.size - good.size
@@ -422,7 +422,7 @@ def _read_track(receiver: Receiver) -> _Track:
 
 def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
     """Times and finite velocities of messages with distinct stamps."""
-    velocity = reading.read_ground_velocity(receiver.columns)[receiver.order]
+    velocity = topic_values.read_ground_velocity(receiver.columns)[receiver.order]
     times = receiver.times[receiver.order]
     mask = np.isfinite(velocity).all(axis=1) & np.concatenate(([True], np.diff(times) > 0.0))
     return times[mask], velocity[mask]
@@ -431,20 +431,20 @@ def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
 def list_turnings(imu: Receiver) -> list[Turning]:
     """Signals of an IMU that turn with the vehicle."""
     times = imu.times[imu.order]
-    if times.size < reading.FEWEST_MESSAGES:
+    if times.size < topic_values.FEWEST_MESSAGES:
         return []
-    rates, _ = reading.read_imu(imu.columns)
+    rates, _ = topic_values.read_imu(imu.columns)
     rate = rates[imu.order, 2]
     read = np.isfinite(rate)
     turnings = []
-    if read.sum() >= reading.FEWEST_MESSAGES:
+    if read.sum() >= topic_values.FEWEST_MESSAGES:
         angle = arrays.integrate_rate(times[read], rate[read])
         turnings.append(Turning(f"the gyro of {imu.columns.topic}", times[read], angle))
-    attitude = reading.read_attitude(imu.columns)
+    attitude = topic_values.read_attitude(imu.columns)
     if attitude is not None:
         attitude = attitude[imu.order]
         known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
-        if known.sum() >= reading.FEWEST_MESSAGES:
+        if known.sum() >= topic_values.FEWEST_MESSAGES:
             yaw = np.unwrap(rigid.euler_from_quaternions(attitude[known])[2])
             turnings.append(Turning(f"the orientation of {imu.columns.topic}", times[known], yaw))
     return turnings
@@ -452,9 +452,9 @@ def list_turnings(imu: Receiver) -> list[Turning]:
 
 def read_headings(number: Receiver, field: str) -> list[Turning]:
     """A number that may be a heading, in radians and in degrees: the course tells which, and its sense."""
-    values, times = reading.numbers(number.columns, field)[number.order], number.times[number.order]
+    values, times = topic_values.numbers(number.columns, field)[number.order], number.times[number.order]
     known = np.isfinite(values)
-    if known.sum() < reading.FEWEST_MESSAGES:
+    if known.sum() < topic_values.FEWEST_MESSAGES:
         return []
     name, angles = number.columns.topic, (values[known], np.radians(values[known]))
     return [Turning(name, times[known], np.unwrap(angle)) for angle in angles]

@@ -15,8 +15,8 @@ import numpy as np
 
 from pipeline.core import PAUSE_NS, Flags, Floats, Ints, robust_spread
 from pipeline.logs import LATEST_NS
-from pipeline.stages import timing
-from pipeline.stages.findings import Finding, Severity, StageError
+from pipeline.recording import clock_maps
+from pipeline.recording.findings import Finding, Severity, StageError
 
 Stamps = Ints
 
@@ -161,7 +161,7 @@ def _require_advance(clock: TopicClock) -> None:
         StageError: ``no_clock``.
     """
     times = clock.stamp[clock.usable]
-    if times.size >= timing.FEWEST_PIECES and not np.ptp(times):
+    if times.size >= clock_maps.FEWEST_PIECES and not np.ptp(times):
         which = "stamps" if clock.clock == "header" else f"{clock.clock} times"
         what = f"the {which} of {clock.topic} stand still, and it has no other clock"
         hint = "Record it with a clock that is set, or as a type with a header."
@@ -235,27 +235,27 @@ def _follow_simulated_time(
         key=lambda times: -times.log_time.size,
     )
     for leading in stamped:
-        clock_map = timing.map_clock(leading.log_time, cast("Stamps", leading.header_time))
+        clock_map = clock_maps.map_clock(leading.log_time, cast("Stamps", leading.header_time))
         if clock_map is not None and _is_simulated(clock_map):
             return _follow(recorded, clock_map, leading.topic)
     return recorded, []
 
 
-def _is_simulated(clock_map: timing.ClockMap) -> bool:
+def _is_simulated(clock_map: clock_maps.ClockMap) -> bool:
     """Whether stamps have another rate than the recorder's time, or an uneven rate and another origin."""
     # A leap of the clock changes the rate of the whole run, varying delays change that of its pieces.
     off, span = (
         min(abs(clock_map.usual_rate - 1.0), abs(clock_map.rate - 1.0)),
         float(clock_map.log[-1] - clock_map.log[0]),
     )
-    if off >= _OTHER_RATE and off * span >= timing.JUMP_NS:
+    if off >= _OTHER_RATE and off * span >= clock_maps.JUMP_NS:
         return True
     apart = abs(float(np.median(clock_map.log - clock_map.stamp)))
     return apart > DAY_NS and clock_map.bend_s > _BENT_S and not clock_map.leaps
 
 
 def _follow(
-    recorded: Mapping[str, Recorded], clock_map: timing.ClockMap, leading: str
+    recorded: Mapping[str, Recorded], clock_map: clock_maps.ClockMap, leading: str
 ) -> tuple[Mapping[str, Recorded], list[Finding]]:
     mapped, real = {}, []
     for key, times in recorded.items():
@@ -287,7 +287,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         for key, header in headers.items()
     }
     drifts = {
-        key: timing.measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
+        key: clock_maps.measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
         for key, header in headers.items()
     }
     known = [drift for drift in drifts.values() if drift.is_certain]
@@ -355,7 +355,7 @@ def _is_steady(log_time: Stamps, period: float) -> bool:
     """Whether equal numbers of messages take equal times, unlike those of a hand on a joystick."""
     many = max(round(_PACE_NS / period), _FEWEST_OF_PACE) if period > 0.0 else log_time.size
     took = np.diff(log_time[::many]).astype(np.float64)
-    if took.size < timing.FEWEST_PIECES:
+    if took.size < clock_maps.FEWEST_PIECES:
         return False
     usual = float(np.median(took))
     return robust_spread(took - usual) < _STEADY * usual
@@ -415,7 +415,7 @@ def _mend_jumps(
     jumped = np.abs(passed - period) >= np.abs(recorded - period)
     # A delay that ends takes stamps forward, too, but to no time after that of their recording.
     is_far = np.abs(np.diff(offset[known])) > np.where(
-        _is_future(offset[known[:-1]], offset[known[1:]]), _BACKWARD_NS, timing.JUMP_NS
+        _is_future(offset[known[:-1]], offset[known[1:]]), _BACKWARD_NS, clock_maps.JUMP_NS
     )
     candidates = np.flatnonzero((is_far & jumped) | (passed < -_BACKWARD_NS))
     edges = [0]
@@ -423,7 +423,7 @@ def _mend_jumps(
         before = np.median(offset[known[max(edges[-1], index + 1 - _AROUND) : index + 1]])
         after = np.median(offset[known[index + 1 : index + 1 + _AROUND]])
         moved = after - before
-        least = _BACKWARD_NS if _is_future(before, after) else timing.JUMP_NS
+        least = _BACKWARD_NS if _is_future(before, after) else clock_maps.JUMP_NS
         if moved > least or moved < -_BACKWARD_NS:
             edges.append(int(index) + 1)
     edges.append(known.size)

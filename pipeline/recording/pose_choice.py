@@ -18,8 +18,14 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, SlipError, arrays, format_share, rigid
-from pipeline.run import LIVE_SHARE, SPAN_S
+from pipeline.core import Flags, Floats, SlipError, arrays, fit_robustly, format_share, rigid
+from pipeline.recording.drive import read_speed
+from pipeline.recording.extract import Given, extract_tables
+from pipeline.recording.findings import Finding
+from pipeline.recording.pose_topics import SLOW_HZ
+from pipeline.recording.satellite import estimate_noise
+from pipeline.recording.topic_values import FEWEST_MESSAGES
+from pipeline.run import LIVE_SHARE, SPAN_S, STILL_MPS
 from pipeline.sources import (
     DEAD_RECKONED,
     FILTERED,
@@ -29,14 +35,10 @@ from pipeline.sources import (
     Vehicle,
     is_localization,
 )
-from pipeline.stages.drive import read_speed
-from pipeline.stages.extract import Given, extract_tables
-from pipeline.stages.findings import Finding
-from pipeline.stages.pose_topics import SLOW_HZ
-from pipeline.stages.reading import FEWEST_MESSAGES
-from pipeline.stages.satellite import estimate_noise
-from pipeline.stages.trust import ONE_SCALE, measure_rest
 
+ONE_SCALE = 0.2
+"""Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
+not."""
 _FIXED_FRAME: Final = re.compile(
     r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"
 )
@@ -377,6 +379,15 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
     if known.sum() < FEWEST_MESSAGES:
         return None
     return measure_rest(np.diff(yaw[ends])[known], turned[known], np.diff(at)[known])
+
+
+def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:
+    """Median residual of a robust fit of ``moved`` on ``driven`` and ``changed``, relative to ``moved``."""
+    size = float(np.sqrt(np.mean(moved**2)))
+    if size < STILL_MPS * SPAN_S:
+        return None
+    _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
+    return float(np.median(np.abs(rest))) / size
 
 
 def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:

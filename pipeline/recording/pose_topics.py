@@ -18,9 +18,9 @@ from pipeline.logs import (
     TransformBuffer,
     TransformSeries,
 )
+from pipeline.recording.findings import Finding, StageError
+from pipeline.recording.topic_values import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 from pipeline.sources import PoseFields, PoseSource, Vehicle, VelocitySection, is_localization, plain_type
-from pipeline.stages.findings import Finding, StageError
-from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
@@ -132,28 +132,6 @@ class Track:
     held: Flags
     segment: Ints
     findings: tuple[Finding, ...] = field(default=())
-
-
-@dataclass(frozen=True)
-class Cut:
-    """Poses that were cut, which are cut once where the examination and the run read them alike.
-
-    Attributes:
-        recorded: arguments of `cut_track`.
-        track: what it made of them.
-    """
-
-    recorded: tuple[Floats | Flags | VelocitySection | str, ...]
-    track: Track
-
-    def is_of(self, recorded: Sequence[Floats | Flags | VelocitySection | str]) -> bool:
-        """Whether these were cut."""
-        return all(
-            np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-            if isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
-            else one == other
-            for one, other in zip(recorded, self.recorded, strict=True)
-        )
 
 
 POSE_FINDINGS: Final = frozenset({"bad_quaternion", "bad_pose", "poses_apart"})

@@ -11,6 +11,8 @@ from msgspec import structs
 
 from pipeline.core import Flags, Floats, spread_equal
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
+from pipeline.recording import topic_values
+from pipeline.recording.findings import Finding, StageError
 from pipeline.run import LIVE_SHARE
 from pipeline.sources import (
     DriveForm,
@@ -23,8 +25,6 @@ from pipeline.sources import (
     list_factors,
     list_ranges,
 )
-from pipeline.stages import reading
-from pipeline.stages.findings import Finding, StageError
 
 SIDES = ("left", "right")
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
@@ -181,7 +181,7 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> s
         live &= np.abs(turned) > LIVE_SHARE * float(
             np.max(np.abs(turned[live]), initial=_STILL_RADPS / LIVE_SHARE)
         )
-        if live.sum() < reading.FEWEST_MESSAGES:
+        if live.sum() < topic_values.FEWEST_MESSAGES:
             return None
         ratio = velocity[live] / turned[live]
         gain = float(np.median(ratio))
@@ -386,14 +386,14 @@ def read_signal(
         ConfigurationError: ``unit_unknown``.
     """
     signal = source.signals[number]
-    paths = [reading.numbers(columns, path) for path in signal.fields()]
+    paths = [topic_values.numbers(columns, path) for path in signal.fields()]
     # A controller of one wheel has no second: a list element that no message has is left out of the average.
     there = [values for values in paths if np.isfinite(values).any()] or paths
     raw = np.mean(there, axis=0) * signal.sign
     own = dict(vehicle.units)
     per_turn = section.per_turn
     if per_turn is None and signal.per_turn:
-        per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn)))
+        per_turn = float(np.nanmedian(topic_values.numbers(columns, signal.per_turn)))
         least, largest = list_ranges(DriveSection)["per_turn"]
         per_turn = per_turn if least <= per_turn <= largest else None
     if per_turn is not None:
@@ -500,14 +500,16 @@ def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] |
         table: `wheels` or `commands`.
         vehicle: its wheel radius converts wheel speeds.
     """
-    if table.height < reading.FEWEST_MESSAGES:
+    if table.height < topic_values.FEWEST_MESSAGES:
         return None
     if table["speed"].null_count() < table.height:
         speed = table["speed"].to_numpy()
     else:
         speed = 0.5 * vehicle.wheel_radius_m * (table["left"] + table["right"]).to_numpy()
     known = np.isfinite(speed)
-    return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= reading.FEWEST_MESSAGES else None
+    return (
+        (table["t"].to_numpy()[known], speed[known]) if known.sum() >= topic_values.FEWEST_MESSAGES else None
+    )
 
 
 _FEW_REPEATS = 0.05

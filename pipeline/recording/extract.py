@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 import numpy as np
@@ -11,7 +11,28 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError
-from pipeline.logs import LogData, TopicColumns, join_channels
+from pipeline.logs import TopicColumns
+from pipeline.recording import pose_topics, topic_values
+from pipeline.recording.clocks import Recorded, TopicClock, align_clocks, find_pauses
+from pipeline.recording.drive import (
+    SIGNALS,
+    differentiate_angle,
+    interpolate_readings,
+    is_angle,
+    is_of_wheels,
+    read_joints,
+    read_pair,
+    read_rates,
+    read_signal,
+    read_speed,
+)
+from pipeline.recording.echo import check_echo
+from pipeline.recording.findings import Finding, StageError, blame_damage
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.lost_messages import fill_gaps
+from pipeline.recording.pose_topics import read_bodies
+from pipeline.recording.tilt import lean
+from pipeline.recording.topic_values import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.sources import (
     DEFAULT_INTERVAL,
     UNKNOWN_VEHICLE,
@@ -28,29 +49,9 @@ from pipeline.sources import (
     find_type,
     list_presets,
 )
-from pipeline.stages import pose_topics, reading
-from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_pauses
-from pipeline.stages.drive import (
-    SIGNALS,
-    differentiate_angle,
-    interpolate_readings,
-    is_angle,
-    is_of_wheels,
-    read_joints,
-    read_pair,
-    read_rates,
-    read_signal,
-    read_speed,
-)
-from pipeline.stages.findings import Finding, StageError, blame_damage
-from pipeline.stages.lost_messages import fill_gaps
-from pipeline.stages.pose_topics import Cut, read_bodies
-from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
-from pipeline.stages.tilt import lean
-from pipeline.stages.trust import check_echo
 
 if TYPE_CHECKING:
-    from pipeline.stages.satellite import Turning
+    from pipeline.recording.satellite import Turning
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
@@ -70,20 +71,18 @@ class Given:
     """A log with what is known of it: what its examination and its extraction start from.
 
     Attributes:
-        data: columns of the wanted topics (see `reading.list_wanted`).
+        log: columns of the wanted topics (see `topic_values.list_wanted`).
         sources: topic of each role; before an examination, candidates by type and name, the likeliest first.
         configuration: units, signs, clocks, intervals.
         vehicle: the log's, or `UNKNOWN_VEHICLE` of its kind.
         where: the log, for error messages.
-        cut: its poses, where they were cut before.
     """
 
-    data: LogData
+    log: LogColumns
     sources: Sources
     configuration: Configuration
     vehicle: Vehicle
     where: str
-    cut: Cut | None = None
 
     @property
     def is_known(self) -> bool:
@@ -94,7 +93,7 @@ class Given:
         """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
         drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
         return self.vehicle.kinematics.has_inputs("sideways") or any(
-            reading.find_sideways_share(self.data.topics, one) for one in drives
+            topic_values.find_sideways_share(self.log.data.topics, one) for one in drives
         )
 
 
@@ -128,20 +127,6 @@ def extract_tables(given: Given) -> Extracted:
     return Extraction(given).run()
 
 
-def _make_alike(channels: Sequence[TopicColumns]) -> list[TopicColumns]:
-    """Channels of several types with the fields that all have, and with stamps if all have them."""
-    shared = set.intersection(*(set(columns.fields) for columns in channels))
-    stamped = all(columns.header_time is not None for columns in channels)
-    return [
-        replace(
-            columns,
-            header_time=columns.header_time if stamped else None,
-            fields={name: column for name, column in columns.fields.items() if name in shared},
-        )
-        for columns in channels
-    ]
-
-
 class Extraction:
     """One log's extraction: columns, common clocks, and findings.
 
@@ -149,26 +134,35 @@ class Extraction:
     """
 
     def __init__(self, given: Given) -> None:
-        topics, self.findings = remove_absurd(given.data.topics)
-        self.data = data = replace(given.data, topics=topics)
+        self.log, self.data = given.log, given.log.data
+        self.findings = list(given.log.findings)
+        topics = self.data.topics
         self.sources = sources = given.sources
         self.configuration = configuration = given.configuration
-        self.vehicle, self.where, self.cut = given.vehicle, given.where, given.cut
+        self.vehicle, self.where = given.vehicle, given.where
         self.frames = ("", "")
         self._orders: dict[str, Ints] = {}
         # What is recorded beside the command explains it: it takes no part in clocks and in the time base.
         beside = sources.body_beside
         aside = None if beside is None else beside.signals[0].topic
-        recorded: dict[str, list[TopicColumns]] = {}
-        for columns in topics:
-            if columns.topic != aside:
-                recorded.setdefault(columns.topic, []).append(columns)
-        joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
-        self.columns = {columns.topic: columns for columns in joined if columns is not None}
-        if configuration.imu.unit == "deg/s":
-            self.take_degrees()
-        used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
-        self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
+        self.columns: dict[str, TopicColumns] = {}
+        for topic in dict.fromkeys(columns.topic for columns in topics if columns.topic != aside):
+            joined, findings = self.log.join(topic)
+            self.findings += findings
+            if joined is not None:
+                self.columns[topic] = joined
+        if (
+            configuration.imu.unit == "deg/s"
+            and sources.imu is not None
+            and sources.imu.topic in self.columns
+        ):
+            turned = topic_values.turn_to_radians(self.columns[sources.imu.topic])
+            self.columns[sources.imu.topic] = turned
+        unfit = self.data.unfit
+        used = (
+            {one.topic for one in topic_values.list_wanted(sources, self.data.index.types)} if unfit else ()
+        )
+        self.findings += [self._report_left_out(one) for one in unfit if one.topic in used]
         pose = sources.pose
         drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
         self.chain = (
@@ -180,11 +174,10 @@ class Extraction:
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
-    def take_degrees(self) -> None:
-        """Take the rates of the gyro for degrees a second, as `[imu] unit` does."""
-        topic = "" if self.sources.imu is None else self.sources.imu.topic
-        if topic in self.columns:
-            self.columns[topic] = reading.turn_to_radians(self.columns[topic])
+    def configure(self, **sections: object) -> Self:
+        """The same log with other sections of the configuration."""
+        configuration = msgspec.structs.replace(self.configuration, **sections)
+        return type(self)(Given(self.log, self.sources, configuration, self.vehicle, self.where))
 
     def run(self) -> Extracted:
         """All tables."""
@@ -196,42 +189,10 @@ class Extraction:
         }
         return Extracted(tables, tuple(self.findings), self.start_ns, self.paused_s, clocks, self.frames)
 
-    def _join_channels(self, topic: str, recorded: Sequence[TopicColumns]) -> TopicColumns | None:
-        """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
-        # All texts of a topic may be unreadable.
-        stamped = [reading.with_stamps(columns) for columns in recorded if columns.log_time.size]
-        channels = [columns for columns in stamped if columns.log_time.size]
-        if len(channels) <= 1:
-            return channels[0] if channels else None
-        types = self._list_types(channels)
-        if len(types) > 1:
-            channels = _make_alike(channels)
-        joined = join_channels(channels)
-        count = len(channels)
-        if joined is not None and len(types) > 1:
-            lacks_stamps = joined.header_time is None and any(one.header_time is not None for one in stamped)
-            values = {"count": len(types), "types": types, "lacks_stamps": lacks_stamps}
-            self.findings.append(Finding("several_types", "warning", topic, values))
-            return joined
-        if joined is not None:
-            self.findings.append(
-                Finding("several_channels", "info", topic, {"kind": "joined", "count": count})
-            )
-            return joined
-        self.findings.append(
-            Finding("several_channels", "warning", topic, {"kind": "fullest", "count": count})
-        )
-        return max(channels, key=lambda columns: columns.log_time.size)
-
-    def _list_types(self, channels: Sequence[TopicColumns]) -> list[str]:
-        """Types of channels as recorded, each once."""
-        ids = {columns.channel_id for columns in channels}
-        return list(dict.fromkeys(one.type_name for one in self.data.index.channels if one.id in ids))
-
     def _report_left_out(self, columns: TopicColumns) -> Finding:
         """Messages of a topic that lack the fields that its other type has."""
         topic, count = columns.topic, columns.log_time.size
-        others = self._list_types([one for one in self.data.topics if one.topic == topic])
+        others = self.log.list_types(self.data.of(topic))
         values = {"count": count, "type": columns.type_name, "others": others}
         if count:
             first, last = ((int(time) - self.data.index.start_ns) / 1e9 for time in columns.log_time[[0, -1]])
@@ -250,7 +211,7 @@ class Extraction:
         if self.chain is not None and self.sources.pose is not None:
             topic, times = self.sources.pose.topic, self.chain
             recorded[topic] = Recorded(topic, times.log_time, times.log_time, times.time, asked.get(topic))
-        clocks, findings = align_clocks(recorded)
+        clocks, findings = self.log.once(align_clocks, recorded)
         self.findings += findings
         pauses = find_pauses(times.log_time for times in recorded.values())
         self.paused_s = sum(after - last for last, after in pauses) / 1e9
@@ -316,8 +277,8 @@ class Extraction:
             asked = [section for section in sections if section.topic] or [_DEFAULT_SECTION]
             if ordered is not None:
                 columns, clock, order = ordered
-                texts = reading.texts(columns, "data")
-                times, said = self._seconds(clock.stamp[order]), [texts[i] for i in order.tolist()]
+                states = topic_values.texts(columns, "data")
+                times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
                 for section in asked:
                     spans += find_spans_of_state(times, said, section)
             states = [section.equals or DEFAULT_INTERVAL[1] for section in asked]
@@ -340,15 +301,15 @@ class Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
-        position, quaternion, leant = reading.put_upright(arrays, self.configuration.pose)
+        position, quaternion, leant = topic_values.put_upright(arrays, self.configuration.pose)
         if leant:
             leaning = {"lean_deg": float(np.degrees(leant))}
             self.findings.append(Finding("body_upside_down", "warning", source.topic, leaning))
         position, quaternion = self._lean(source, times, position, quaternion)
-        recorded = (times, position, quaternion, breaks, self.configuration.velocity, source.topic)
-        if self.cut is None or not self.cut.is_of(recorded):
-            self.cut = Cut(recorded, pose_topics.cut_track(*recorded))
-        track = self.cut.track
+        limits = self.configuration.velocity
+        track = self.log.once(
+            pose_topics.cut_track, times, position, quaternion, breaks, limits, source.topic
+        )
         self.findings += track.findings
         if source.wheels is not None:
             # Wheels at rest repeat their pose, and each reading is new all the same.
@@ -372,8 +333,8 @@ class Extraction:
         imu = self._timed(self.sources.imu.topic) if self.sources.imu and source.wheels is None else None
         if imu is None:
             return position, quaternion
-        turn = pose_topics.find_turn(self.data.topics, reading.frame_of(imu.columns))
-        leaning = lean(times, position, quaternion, imu, turn)
+        turn = pose_topics.find_turn(self.data.topics, topic_values.frame_of(imu.columns))
+        leaning = self.log.once(lean, times, position, quaternion, imu, turn)
         if leaning is None:
             return position, quaternion
         position, quaternion, steepest, angle = leaning
@@ -386,7 +347,7 @@ class Extraction:
         self.findings.append(Finding("slope_by_imu", "info", "pose", values))
         return position, quaternion
 
-    def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+    def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, topic_values.PoseArrays, Flags]:
         """Stamps, log times and poses of base_link in time order, and clock jumps."""
         topic = source.topic
         clock, columns = self.clocks.get(topic), self.columns.get(topic)
@@ -396,7 +357,7 @@ class Extraction:
             return self._follow_wheels(source.wheels, clock)
         if self.chain is not None:
             chain, order = self.chain, self._order(clock)
-            arrays = reading.PoseArrays(
+            arrays = topic_values.PoseArrays(
                 chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
             )
             arrays, log_times = arrays.take(order), chain.log_time
@@ -422,10 +383,10 @@ class Extraction:
 
     def _follow_wheels(
         self, source: DriveSource, clock: TopicClock
-    ) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+    ) -> tuple[Stamps, Stamps, topic_values.PoseArrays, Flags]:
         """Stamps, log times and poses of measured wheels that roll without slip, and clock jumps."""
         wheels, findings = interpolate_readings(
-            self.read_drive(source, self.configuration.wheels, held=False)
+            self.read_drive(source, self.configuration.wheels, self.vehicle, held=False)
         )
         self.findings += findings
         self._refuse_echo(wheels)
@@ -435,7 +396,7 @@ class Extraction:
             for one in kinematics.inputs
         }
         known = np.logical_and.reduce([np.isfinite(values) for values in inputs.values()])
-        if known.sum() < reading.FEWEST_MESSAGES:
+        if known.sum() < topic_values.FEWEST_MESSAGES:
             raise self._nothing("wheels", source.signals[0].topic)
         ahead, aside, turning = kinematics.forward(
             {name: values[known] for name, values in inputs.items()}, self.vehicle
@@ -450,7 +411,7 @@ class Extraction:
         moved = 0.5 * (velocity[1:] + velocity[:-1]) * elapsed * np.exp(1j * (yaw[:-1] + 0.5 * turned))
         path = np.append(0.0, np.cumsum(moved))
         flat = np.zeros(path.size)
-        arrays = reading.PoseArrays(
+        arrays = topic_values.PoseArrays(
             np.column_stack((path.real, path.imag, flat)),
             np.column_stack((flat, flat, np.sin(0.5 * yaw), np.cos(0.5 * yaw))),
             "",
@@ -470,21 +431,23 @@ class Extraction:
             hint = "Record the encoders, or a localization."
             raise StageError("no_pose", what, where=self.where, hint=hint)
 
-    def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
+    def _read_poses(self, source: PoseSource, columns: TopicColumns) -> topic_values.PoseArrays:
         pose = source.fields or find_type(columns.type_name).pose
         if pose is not None and pose.angle:
             asked = self.configuration.pose.yaw_unit
-            unit = asked or reading.find_angle_unit(columns, pose)
+            unit = asked or topic_values.find_angle_unit(columns, pose)
             if unit != (asked or pose.angle_unit):
                 self.findings.append(Finding("heading_unit", "warning", source.topic))
             pose = msgspec.structs.replace(pose, angle_unit=unit)
         if pose is None or not pose.names:
-            return reading.read_pose_topic(columns, pose)
+            return topic_values.read_pose_topic(columns, pose)
         arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
         self.findings.append(Finding("body_chosen", "info", source.topic, {"body": name}))
         return arrays
 
-    def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> reading.Located | None:
+    def _head_positions(
+        self, source: PoseSource, arrays: topic_values.PoseArrays
+    ) -> topic_values.Located | None:
         """Poses with the course as heading if a topic gives positions alone; otherwise None.
 
         A vehicle that moves sideways may keep one heading.
@@ -496,7 +459,7 @@ class Extraction:
             or not pose_topics.lacks_heading(arrays)
         ):
             return None
-        from pipeline.stages.satellite import head_positions  # noqa: PLC0415 - few logs need it
+        from pipeline.recording.satellite import head_positions  # noqa: PLC0415 - few logs need it
 
         located = head_positions(arrays, receiver, self._list_turnings(source), self._read_ahead())
         self.findings += () if located is None else located.findings
@@ -507,21 +470,21 @@ class Extraction:
         drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
         return next((drive for drive in drives if drive is not None), None)
 
-    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
+    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, topic_values.PoseArrays]:
         """Messages of a satellite receiver that give a pose, in time order, and these poses."""
-        from pipeline.stages.satellite import locate_vehicle  # noqa: PLC0415 - few logs need it
+        from pipeline.recording.satellite import locate_vehicle  # noqa: PLC0415 - few logs need it
 
         receiver, beside = self._timed(source.topic), self._timed(source.velocity)
         if receiver is None:
             raise self._nothing("pose", source.topic)
         lever, findings = pose_topics.find_antenna(
-            self.data.topics, reading.frame_of(receiver.columns), source.topic
+            self.data.topics, topic_values.frame_of(receiver.columns), source.topic
         )
         made = locate_vehicle(receiver, beside, self._list_turnings(source), self._read_ahead(), lever)
         self.findings += [*findings, *made.findings]
         if not made.rows.size:
             times = receiver.times[receiver.order]
-            if times.size < reading.FEWEST_MESSAGES:
+            if times.size < topic_values.FEWEST_MESSAGES:
                 raise self._nothing("pose", source.topic)
             rate = 1.0 / max(float(np.median(np.diff(times))), 1e-3)
             slow = f" (at least {pose_topics.SLOW_HZ:g} Hz are needed)" if rate < pose_topics.SLOW_HZ else ""
@@ -535,7 +498,7 @@ class Extraction:
 
     def _list_turnings(self, source: PoseSource) -> list["Turning"]:
         """Sensors that turn with a vehicle of which positions alone are recorded."""
-        from pipeline.stages.satellite import list_turnings, read_headings  # noqa: PLC0415 - few logs need it
+        from pipeline.recording.satellite import list_turnings, read_headings  # noqa: PLC0415 - few logs need it
 
         imu = self._timed(self.sources.imu.topic) if self.sources.imu else None
         turnings = [] if imu is None else list_turnings(imu)
@@ -544,14 +507,14 @@ class Extraction:
             turnings += [] if number is None else read_headings(number, signal.field)
         return turnings
 
-    def _timed(self, topic: str) -> reading.Receiver | None:
+    def _timed(self, topic: str) -> topic_values.Receiver | None:
         ordered = self._ordered(topic)
         if ordered is None:
             return None
         columns, clock, order = ordered
         # Messages with equal stamps have no position on a track.
         order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
-        return reading.Receiver(columns, self._seconds(clock.stamp), order)
+        return topic_values.Receiver(columns, self._seconds(clock.stamp), order)
 
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}
@@ -566,12 +529,14 @@ class Extraction:
 
     @cached_property
     def _commands(self) -> pl.DataFrame:
-        table = self.read_drive(self.sources.command, self.configuration.command, held=True)
+        section = self.configuration.command
+        table = self.read_drive(self.sources.command, section, self.vehicle, held=True)
         beside = self.sources.body_beside
         if beside is None or table.is_empty():
             return table
         topic = beside.signals[0].topic
-        columns = self._join_channels(topic, self.data.of(topic))
+        columns, findings = self.log.join(topic)
+        self.findings += findings
         if columns is None:
             return table
         order = np.argsort(columns.log_time, kind="stable")
@@ -584,30 +549,33 @@ class Extraction:
             pl.Series(name, np.where(at >= 0, value, np.nan)).fill_nan(None) for name, value in values.items()
         )
 
-    def read_drive(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
-        """Table of a drive, in the inputs of `vehicle`; empty without one.
+    def read_drive(
+        self, source: DriveSource | None, section: DriveSection, vehicle: Vehicle, *, held: bool
+    ) -> pl.DataFrame:
+        """Table of a drive; empty without one.
 
         Args:
             source: its topics.
             section: units, signs and names of joints.
+            vehicle: in whose inputs it is.
             held: whether its values are commands, held until the next one.
         """
         if source is None:
             return pl.DataFrame()
         if source.form is DriveForm.JOINTS:
             columns, clock, order = self._require(source.signals[0].topic, held=held)
-            drive, findings = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
+            drive, findings = read_joints(columns, self._seconds(clock.stamp), section, vehicle)
             self.findings += findings
             order = order[is_of_wheels(columns, drive)[order]]
             drive = {name: series[order] for name, series in drive.items()}
             stamp, log_time = clock.stamp[order], columns.log_time[order]
         else:
-            stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
+            stamp, log_time, (first, second) = self._read_pair(source, section, vehicle, held=held)
             topic = source.signals[0].topic
-            nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
-            sideways = self._read_sideways(source, held=held)
+            nominal = not held and topic_values.is_of_base(source, {topic: self.columns[topic].type_name})
+            sideways = self._read_sideways(source, vehicle, held=held)
             drive = read_pair(
-                source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
+                source.form, first, second, section, vehicle, nominal=nominal, sideways=sideways
             )
         if section.late_s:
             stamp = stamp - round(section.late_s * 1e9)
@@ -664,7 +632,7 @@ class Extraction:
         source = self.sources.wheels
         section = self.configuration.wheels
         try:
-            return self.read_drive(source, section, held=False)
+            return self.read_drive(source, section, self.vehicle, held=False)
         except SlipError as error:
             if source is None or section != DriveSection():
                 raise
@@ -677,7 +645,7 @@ class Extraction:
             raise self._nothing("command" if held else "wheels", topic)
         return ordered
 
-    def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
+    def _read_sideways(self, source: DriveSource, vehicle: Vehicle, *, held: bool) -> Floats | None:
         """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None if it has none.
 
         Raises:
@@ -686,42 +654,42 @@ class Extraction:
         if source.form is not DriveForm.BODY:
             return None
         topic = source.signals[0].topic
-        signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
-        moves = self.vehicle.kinematics.has_inputs("sideways")
+        signal = topic_values.sideways_field(source, {topic: self.columns[topic].type_name})
+        moves = vehicle.kinematics.has_inputs("sideways")
         if signal is None:
             if moves and not held:
-                what = f"{source} does not say how {self.vehicle.name} moves sideways"
+                what = f"{source} does not say how {vehicle.name} moves sideways"
                 hint = "Configure an odometry, or a JointState of all wheels."
                 raise StageError("no_sideways", what, where=topic, hint=hint)
             return None
         columns, _, order = self._require(topic, held=held)
         # A message without the number asks for none.
-        sideways = np.nan_to_num(reading.numbers(columns, signal.field)[order])
+        sideways = np.nan_to_num(topic_values.numbers(columns, signal.field)[order])
         if not moves and held:
-            self.findings += self._check_sideways(sideways, topic)
+            self.findings += self._check_sideways(sideways, topic, vehicle)
         return sideways if moves else None
 
-    def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
+    def _check_sideways(self, sideways: Floats, topic: str, vehicle: Vehicle) -> list[Finding]:
         """Commands that this kind of vehicle cannot follow, since it moves along its wheels only."""
-        share = reading.asks_sideways(sideways)
+        share = topic_values.asks_sideways(sideways)
         if share == 0.0:
             return []
         values = {
             "value": share,
-            "vehicle": self.vehicle.name,
-            "vehicle_kind": self.vehicle.kind,
+            "vehicle": vehicle.name,
+            "vehicle_kind": vehicle.kind,
             "presets": [one.id for one in list_presets() if one.kinematics.has_inputs("sideways")],
         }
         return [Finding("sideways_command", "error", topic, values)]
 
     def _read_pair(
-        self, source: DriveSource, section: DriveSection, *, held: bool
+        self, source: DriveSource, section: DriveSection, vehicle: Vehicle, *, held: bool
     ) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
         """Two signals at common times: held commands at all stamps, measurements at those of the first."""
         series = []
         for number, signal in enumerate(source.signals):
             columns, clock, order = self._require(signal.topic, held=held)
-            values = read_signal(columns, source, number, section, self.vehicle)[order]
+            values = read_signal(columns, source, number, section, vehicle)[order]
             if is_angle(source, section):
                 values = differentiate_angle(self._seconds(clock.stamp[order]), values)
             series.append((clock.stamp[order], columns.log_time[order], values))
@@ -744,7 +712,7 @@ class Extraction:
         if ordered is None:
             return pl.DataFrame()
         columns, clock, order = ordered
-        rates, forces = reading.read_imu(columns)
+        rates, forces = topic_values.read_imu(columns)
         times = self._seconds(clock.stamp[order])
         return pl.DataFrame(
             {

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.core import LONGEST_NAME, Flags, Floats, Ints, rigid, shorten
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.logs.columns import complete_stamps, join_times
+from pipeline.recording.findings import Finding, StageError
 from pipeline.run import STILL_MPS
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -29,7 +30,6 @@ from pipeline.sources import (
     find_type,
 )
 from pipeline.sources.message_types import find_alike
-from pipeline.stages.findings import Finding, StageError
 
 _LARGEST = 1e12
 """Largest number in SI units, above any position, angle, speed and acceleration; its powers stay finite."""

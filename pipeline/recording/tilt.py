@@ -9,7 +9,7 @@ orientations, roll and pitch are those of its specific force less the accelerati
 import numpy as np
 
 from pipeline.core import Complex, Flags, Floats, arrays, join_parts, rigid
-from pipeline.stages import reading
+from pipeline.recording import topic_values
 
 _LEVEL_RAD = 1e-3
 """Range of roll and pitch [rad] below which poses are in the plane: rounding is less, and any ground more."""
@@ -35,7 +35,7 @@ _TURNED_RAD = np.radians(30.0)
 
 
 def lean(
-    times: Floats, position: Floats, quaternion: Floats, imu: reading.Receiver, turn: Floats | None
+    times: Floats, position: Floats, quaternion: Floats, imu: topic_values.Receiver, turn: Floats | None
 ) -> tuple[Floats, Floats, float, float] | None:
     """Poses in the plane with the slopes of an IMU; None where poses or IMU give no reason.
 
@@ -54,7 +54,7 @@ def lean(
     if max(_span(roll), _span(pitch)) > _LEVEL_RAD:
         return None
     at, force, attitude = _read(imu)
-    if at.size < reading.FEWEST_MESSAGES:
+    if at.size < topic_values.FEWEST_MESSAGES:
         return None
     body, inside = _measure_acceleration(times, position, yaw, at)
     if attitude is not None:
@@ -83,15 +83,15 @@ def lean(
     return position, leaning, float(np.abs([low, high]).max()), angle
 
 
-def _read(imu: reading.Receiver) -> tuple[Floats, Floats, Floats | None]:
+def _read(imu: topic_values.Receiver) -> tuple[Floats, Floats, Floats | None]:
     """Times [s], specific forces (m, 3) and orientations (m, 4) of an IMU; None if it has no orientations."""
-    at, force = imu.times[imu.order], reading.read_imu(imu.columns)[1][imu.order]
-    attitude = reading.read_attitude(imu.columns)
+    at, force = imu.times[imu.order], topic_values.read_imu(imu.columns)[1][imu.order]
+    attitude = topic_values.read_attitude(imu.columns)
     if attitude is not None:
         attitude = attitude[imu.order]
         known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
         # A sensor without one repeats the first that it had.
-        if known.sum() >= reading.FEWEST_MESSAGES and np.ptp(attitude[known], axis=0).any():
+        if known.sum() >= topic_values.FEWEST_MESSAGES and np.ptp(attitude[known], axis=0).any():
             return at[known], force[known], attitude[known]
     known = np.isfinite(force).all(axis=1)
     return at[known], force[known], None
@@ -122,7 +122,7 @@ def _lean_by_force(
 
     None where they are not those of gravity, or where nothing shows how their sensor is mounted.
     """
-    size = np.median(np.linalg.norm(force, axis=1)) if at.size >= reading.FEWEST_MESSAGES else 0.0
+    size = np.median(np.linalg.norm(force, axis=1)) if at.size >= topic_values.FEWEST_MESSAGES else 0.0
     if abs(size / rigid.GRAVITY_MPS2 - 1.0) > _UNIT:
         return None
     if turn is not None:
@@ -180,7 +180,7 @@ def _measure_acceleration(times: Floats, position: Floats, yaw: Floats, at: Floa
     good = np.isfinite(position).all(axis=1) & np.isfinite(yaw) & (np.diff(times, prepend=-np.inf) > 0.0)
     times, plane = times[good], position[good, :2]
     inside: Flags = np.zeros(at.size, dtype=bool)
-    if times.size < reading.FEWEST_MESSAGES:
+    if times.size < topic_values.FEWEST_MESSAGES:
         return np.zeros(0, dtype=np.complex128), inside
     inside = (at > times[0] + _WINDOW_S) & (at < times[-1] - _WINDOW_S) & (np.diff(at, prepend=-np.inf) > 0.0)
     at = at[inside]
@@ -193,7 +193,7 @@ def _measure_acceleration(times: Floats, position: Floats, yaw: Floats, at: Floa
 
 def _smooth(at: Floats, values: Complex) -> Complex:
     """Means over windows as those of the acceleration, less their own mean, shape (m,)."""
-    if at.size < reading.FEWEST_MESSAGES:
+    if at.size < topic_values.FEWEST_MESSAGES:
         return np.zeros(at.size, dtype=np.complex128)
     known = np.nan_to_num(values)
     means = join_parts(_average(at, known.real), _average(at, known.imag))
