@@ -229,7 +229,7 @@ def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Fl
         raise _no_wheels(columns.topic, ())
     if not joints.interfaces:
         velocity, position = (
-            _joint_matrix(columns.fields[field], names) for field in (joints.velocity, joints.position)
+            _joint_matrix(columns.fields.get(field), names) for field in (joints.velocity, joints.position)
         )
         return velocity, position
     interfaces, values = columns.fields[joints.interfaces], columns.fields[joints.values]
