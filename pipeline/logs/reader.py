@@ -473,9 +473,9 @@ def _find_repeated(
 
 
 _OTHER_VERSION: Final = (
-    "the log does not hold the definition of {kind}, and the messages are of another version of {package} than "
-    "the definition that is known here: record to MCAP, which holds the definitions (`ros2 bag record -s mcap`), "
-    "or convert the log to MCAP where that version of {package} is installed (`ros2 bag convert`)"
+    "the log does not hold the definition of {kind}, and the messages are of another version of {package} "
+    "than the definition that is known here: record to MCAP, which holds the definitions (`ros2 bag record "
+    "-s mcap`), or convert the log to MCAP where that version of {package} is installed (`ros2 bag convert`)"
 )
 
 
