@@ -32,7 +32,6 @@ from pipeline.stages import pose_topics, reading
 from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_pauses
 from pipeline.stages.drive import (
     SIGNALS,
-    differentiate_angle,
     interpolate_readings,
     is_angle,
     is_of_wheels,
@@ -45,6 +44,7 @@ from pipeline.stages.drive import (
 from pipeline.stages.findings import Finding, StageError, blame_damage
 from pipeline.stages.lost_messages import fill_gaps
 from pipeline.stages.pose_topics import Cut, read_bodies
+from pipeline.stages.rates import differentiate_angle, report_jumps
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.tilt import lean
 from pipeline.stages.trust import check_echo
@@ -745,7 +745,9 @@ class Extraction:
             columns, clock, order = self._require(signal.topic, held=held)
             values = read_signal(columns, source, number, section, self.vehicle)[order]
             if is_angle(source, section):
-                values = differentiate_angle(self._seconds(clock.stamp[order]), values)
+                times = self._seconds(clock.stamp[order])
+                self.findings += report_jumps(signal.topic, times, {str(signal): values})
+                values = differentiate_angle(times, values)
             series.append((clock.stamp[order], columns.log_time[order], values))
         (first, log_first, a), (second, log_second, b) = series
         if np.array_equal(first, second):

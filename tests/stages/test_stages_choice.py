@@ -24,7 +24,8 @@ from pipeline.sources import (
     load_configuration,
 )
 from pipeline.stages.clocks import Recorded, align_clocks
-from pipeline.stages.drive import read_joints, unwrap_counter
+from pipeline.stages.drive import read_joints
+from pipeline.stages.rates import unwrap_counter
 from pipeline.stages.extract import Given, extract_tables
 from pipeline.stages.reading import (
     PoseArrays,
