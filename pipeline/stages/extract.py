@@ -170,9 +170,9 @@ class Extraction:
         used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
         self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
         pose = sources.pose
-        drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
+        self._drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
         self.chain = (
-            pose_topics.chain_poses(topics, pose, self.where, drive=drive)
+            pose_topics.chain_poses(topics, pose, self.where, drive=self._drive)
             if pose and pose.from_transforms
             else None
         )
@@ -412,7 +412,7 @@ class Extraction:
                 chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
             )
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += pose_topics.report_chain(chain, source)
+            self.findings += pose_topics.report_chain(chain, source, self.data.topics, self._drive)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:

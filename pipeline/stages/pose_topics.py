@@ -3,6 +3,7 @@
 import itertools
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -386,7 +387,8 @@ def chain_poses(
     """Poses of base_link along the chain of transforms.
 
     Without configured frames the child is base_link (or base_footprint, base), else the only frame that
-    moves, or the only one in the namespace of the drive; the parent is the first of map, world and odom among
+    moves, or the only one in the namespace of the drive; of several robots it is that of the drive's
+    namespace, or else the first. The parent is the first of map, world and odom among
     the child's ancestors, else its topmost ancestor.
 
     Args:
@@ -409,7 +411,7 @@ def chain_poses(
 def _choose_frames(buffer: TransformBuffer, where: str, drive: str) -> tuple[str, str]:
     parents = {link.child: link.parent for link in buffer.links()}
     frames = buffer.frames()
-    bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
+    bases = _list_bases(frames, drive)
     child = bases[0] if bases else _find_moving_frame(buffer, where, drive)
     above = [child]
     while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
@@ -419,6 +421,20 @@ def _choose_frames(buffer: TransformBuffer, where: str, drive: str) -> tuple[str
         hint = f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}."
         raise StageError("no_base_frame", f"the transforms give {child} no parent", where=where, hint=hint)
     return (named[0] if named else above[-1]), child
+
+
+def _list_bases(frames: Sequence[str], drive: str) -> list[str]:
+    """Frames of bases, those of the robot in whose namespace the drive is first."""
+    spaces = drive.strip("/").split("/")[:-1]
+    prefixed = {f"{space}_{base}" for space in spaces for base in _BASES}
+    bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
+    bases += [frame for frame in frames if frame.rsplit("/", 1)[-1] in prefixed]
+    return sorted(bases, key=lambda frame: not _is_within(frame, spaces))
+
+
+def _is_within(frame: str, spaces: Sequence[str]) -> bool:
+    """Whether a frame is of a robot in one of the namespaces, by its prefix."""
+    return any(space in frame.split("/")[:-1] or frame.startswith(f"{space}_") for space in spaces)
 
 
 def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
@@ -442,11 +458,21 @@ def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
     return chosen[0]
 
 
-def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
-    """Findings on a chain."""
+def report_chain(
+    series: TransformSeries, source: PoseSource, topics: Sequence[TopicColumns], drive: str
+) -> list[Finding]:
+    """Findings on a chain.
+
+    Args:
+        series: the chain.
+        source: the choice, with frames if configured.
+        topics: all topics that were read.
+        drive: topic of the drive.
+    """
     topic = source.topic
     text = f"poses are the transform from {series.parent} to {series.child}"
     findings = [Finding("transforms", "info", text, where=topic)]
+    findings += [] if source.frames else _report_robots(series.child, topics, topic, drive)
     if source.frames is None and series.child.rsplit("/", 1)[-1] not in _BASES:
         text = (
             f"no frame is called base_link: {series.child}, the only one that moves"
@@ -466,6 +492,26 @@ def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
         )
         findings.append(Finding("sparse_corrections", "info", text, where=topic))
     return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
+
+
+def _report_robots(child: str, topics: Sequence[TopicColumns], topic: str, drive: str) -> list[Finding]:
+    """A finding where the transforms are of several robots: which one is taken, and why."""
+    bases = _list_bases(TransformBuffer([one for one in topics if is_transforms(one)]).frames(), drive)
+    name = child.rsplit("/", 1)[-1]
+    others = [frame for frame in bases if frame != child and frame.rsplit("/", 1)[-1] == name]
+    if not others:
+        return []
+    is_own = _is_within(child, drive.strip("/").split("/")[:-1])
+    text = f"{topic} holds the transforms of several robots ({name_first(sorted((child, *others)))}): "
+    text += (
+        f"{child} is taken, in the namespace of {drive}"
+        if is_own
+        else f"{child} is taken, and no namespace of {drive} says which is driven; [pose] frames = "
+        "[parent, child] names another"
+    )
+    return [
+        Finding("several_robots", "info" if is_own else "warning", text, where=topic, count=1 + len(others))
+    ]
 
 
 def report_frame(topic: str, parent: str) -> list[Finding]:
@@ -543,9 +589,11 @@ def find_turn(topics: Sequence[TopicColumns], frame: str) -> Floats | None:
 def _find_base(topics: Sequence[TopicColumns], child: str) -> tuple[str, TransformSeries | None]:
     """The base's frame and its pose in a frame of the vehicle; None without a chain of static transforms."""
     buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
-    base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
-    try:
-        offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64)) if base else None
-    except LogError:
-        offset = None
-    return base, offset if offset is not None and offset.position.shape[0] else None
+    # Of several robots, static transforms lead to the base of the child's own.
+    bases = [frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]]
+    for base in bases:
+        with suppress(LogError):
+            offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64))
+            if offset.position.shape[0]:
+                return base, offset
+    return next(iter(bases), ""), None
