@@ -175,8 +175,8 @@ def _leave_coarse_stamps(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Re
         count = "whole seconds" if tick == _APART_NS else f"steps of {tick / 1e9:g} s"
         period = float(np.median(np.diff(times.log_time))) / 1e9
         text = (
-            f"the stamps of {times.topic} count {count}, and its messages come every {period:.2g} s: they are "
-            "no times of its messages, and log times were used"
+            f"the stamps of {times.topic} count {count}, and its messages come every {period:.2g} s: they "
+            "are no times of its messages, and log times were used"
         )
         findings.append(Finding("coarse_stamps", "warning", text, where=times.topic, value=tick / 1e9))
     return kept, findings

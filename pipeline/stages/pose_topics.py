@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
@@ -20,7 +20,7 @@ from pipeline.logs import (
     TransformSeries,
 )
 from pipeline.sources import PoseFields, PoseSource, Vehicle, VelocitySection, is_localization, plain_type
-from pipeline.stages.findings import Finding, StageError
+from pipeline.stages.findings import Finding, Severity, StageError
 from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
@@ -413,9 +413,7 @@ def _choose_frames(buffer: TransformBuffer, where: str, drive: str) -> tuple[str
     frames = buffer.frames()
     bases = _list_bases(frames, drive)
     child = bases[0] if bases else _find_moving_frame(buffer, where, drive)
-    above = [child]
-    while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
-        above.append(parents[above[-1]])
+    above = _climb(parents, child)
     named = [frame for fixed in _FIXED for frame in above[1:] if frame.rsplit("/", 1)[-1] == fixed]
     if not named and len(above) == 1:
         hint = f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}."
@@ -496,9 +494,11 @@ def report_chain(
 
 def _report_robots(child: str, topics: Sequence[TopicColumns], topic: str, drive: str) -> list[Finding]:
     """A finding where the transforms are of several robots: which one is taken, and why."""
-    bases = _list_bases(TransformBuffer([one for one in topics if is_transforms(one)]).frames(), drive)
-    name = child.rsplit("/", 1)[-1]
-    others = [frame for frame in bases if frame != child and frame.rsplit("/", 1)[-1] == name]
+    buffer = TransformBuffer([one for one in topics if is_transforms(one)])
+    parents = {link.child: link.parent for link in buffer.links()}
+    bases = [frame for frame in _list_bases(buffer.frames(), drive) if _end_of(frame) == _end_of(child)]
+    # The base of an arm on the robot is below its own.
+    others = [frame for frame in bases if child not in _climb(parents, frame)]
     if not others:
         return []
     is_own = _is_within(child, drive.strip("/").split("/")[:-1])
@@ -509,9 +509,22 @@ def _report_robots(child: str, topics: Sequence[TopicColumns], topic: str, drive
         else f"{child} is taken, and no namespace of {drive} says which is driven; [pose] frames = "
         "[parent, child] names another"
     )
-    return [
-        Finding("several_robots", "info" if is_own else "warning", text, where=topic, count=1 + len(others))
-    ]
+    severity: Severity = "info" if is_own else "warning"
+    return [Finding("several_robots", severity, text, where=topic, count=1 + len(others))]
+
+
+def _end_of(frame: str) -> str:
+    """The base's own name at the end of a frame's."""
+    name = frame.rsplit("/", 1)[-1]
+    return next((base for base in _BASES if name == base or name.endswith(f"_{base}")), name)
+
+
+def _climb(parents: Mapping[str, str], frame: str) -> list[str]:
+    """A frame and all above it."""
+    above = [frame]
+    while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
+        above.append(parents[above[-1]])
+    return above
 
 
 def report_frame(topic: str, parent: str) -> list[Finding]:

@@ -12,8 +12,8 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core.arrays import Floats
 from pipeline.simulate import Encoders, Recording, make_scenario, simulate_run, write_log
-from pipeline.stages.rates import differentiate_angle
 from pipeline.stages.pose_choice import integrate_between
+from pipeline.stages.rates import differentiate_angle
 
 
 def fall_silent(time: Floats) -> Floats:
