@@ -427,7 +427,8 @@ def _list_bases(frames: Sequence[str], drive: str) -> list[str]:
     prefixed = {f"{space}_{base}" for space in spaces for base in _BASES}
     bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
     bases += [frame for frame in frames if frame.rsplit("/", 1)[-1] in prefixed]
-    return sorted(bases, key=lambda frame: not _is_within(frame, spaces))
+    # The base of an arm on a robot has a longer name than its own.
+    return sorted(bases, key=lambda frame: (not _is_within(frame, spaces), frame.count("/")))
 
 
 def _is_within(frame: str, spaces: Sequence[str]) -> bool:
