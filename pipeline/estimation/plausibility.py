@@ -63,8 +63,8 @@ def note_unusual(effects: Iterable[Named]) -> list[Finding]:
                 continue
             unit = suffix_unit(p.unit)
             text = (
-                f"{p.name} = {value:.3g}{unit} of {named.id} is unusual ({low:g} to {high:g}{unit} is usual), and "
-                "the data prove it: a wrong unit, scale or length has the same effect"
+                f"{p.name} = {value:.3g}{unit} of {named.id} is unusual (usual: {low:g} to {high:g}{unit}), "
+                "and the data prove it: a wrong unit, scale or length has the same effect"
             )
             findings.append(Finding("unusual_value", text, named.id, "warning", value))
     return findings

@@ -166,12 +166,12 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
 
 def _leave_coarse_stamps(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
     """Topics without stamps that are too coarse for their rate: these are no times of their messages."""
-    kept, findings = dict(recorded), []
+    plain, findings = dict(recorded), []
     for key, times in recorded.items():
         tick = _find_tick_ns(times)
         if not tick:
             continue
-        kept[key] = replace(times, header_time=None)
+        plain[key] = replace(times, header_time=None)
         count = "whole seconds" if tick == _APART_NS else f"steps of {tick / 1e9:g} s"
         period = float(np.median(np.diff(times.log_time))) / 1e9
         text = (
@@ -179,7 +179,7 @@ def _leave_coarse_stamps(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Re
             "are no times of its messages, and log times were used"
         )
         findings.append(Finding("coarse_stamps", "warning", text, where=times.topic, value=tick / 1e9))
-    return kept, findings
+    return plain, findings
 
 
 def _find_tick_ns(times: Recorded) -> int:

@@ -53,8 +53,8 @@ def find_jumps(times: Floats, series: Floats) -> Ints:
     # The first and the last ones have neighbours on one side only.
     padded = np.pad(rates, _NEIGHBOURS)
     shifts = (shift for shift in range(2 * _NEIGHBOURS + 1) if shift != _NEIGHBOURS)
-    around = np.max([padded[shift : shift + rates.size] for shift in shifts], axis=0)
-    alone = rates > _FAR * around
+    beside = np.max([padded[shift : shift + rates.size] for shift in shifts], axis=0)
+    alone = rates > _FAR * beside
     usual = float(np.max(rates[~alone], initial=0.0))
     return fresh[alone & (rates > _FAR * usual)] if usual > 0.0 else fresh[:0]
 
@@ -168,17 +168,17 @@ def settle_joints(topic: str, velocity: Mapping[str, Floats], turned: Mapping[st
             "measured, and the positions were differentiated"
         )
         findings.append(Finding("velocity_zero", "warning", text, where=topic))
-    told = {joint: gain for joint, gain in gains.items() if joint not in none}
-    if len(told) + len(none) < len(velocity) or not told:
+    known = {joint: gain for joint, gain in gains.items() if joint not in none}
+    if len(known) + len(none) < len(velocity) or not known:
         return Settled("", none, tuple(findings))
     factors = list_factors("rad/s") | {"rev/s": 2.0 * math.pi}
-    unit = next((name for name, one in factors.items() if _all_near(told.values(), 1.0 / one)), "")
-    if unit or _all_near(told.values(), 1.0):
+    unit = next((name for name, one in factors.items() if _all_near(known.values(), 1.0 / one)), "")
+    if unit or _all_near(known.values(), 1.0):
         return Settled(unit, none, tuple(findings))
-    if meant := next((name for name, per in _POSITIONS.items() if _all_near(told.values(), 1.0 / per)), ""):
+    if meant := next((name for name, per in _POSITIONS.items() if _all_near(known.values(), 1.0 / per)), ""):
         text = f"the positions of {topic} are what its velocities turn, in {meant}: the velocities are used"
         return Settled("", none, (*findings, Finding("position_unit", "info", text, where=topic)))
-    return _choose_side(topic, told, turned, Settled("", none, tuple(findings)))
+    return _choose_side(topic, known, turned, Settled("", none, tuple(findings)))
 
 
 def _choose_side(

@@ -25,8 +25,8 @@ from pipeline.sources import (
 )
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints
-from pipeline.stages.rates import unwrap_counter
 from pipeline.stages.extract import Given, extract_tables
+from pipeline.stages.rates import unwrap_counter
 from pipeline.stages.reading import (
     PoseArrays,
     find_angle_unit,
