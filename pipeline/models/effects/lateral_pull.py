@@ -24,7 +24,7 @@ LateralPull = declare(
         plausible=Plausible(-0.35, 0.35, "as of a yaw misalignment"),
     ),
     rank=21,
-    kinds=("omni", "mecanum"),
+    kinds=("mecanum", "omni"),
     needs=(Excitation.BOTH_SIGNS,),
     confused_with=("yaw_misalignment", "lateral_drift"),
 )

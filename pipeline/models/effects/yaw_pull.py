@@ -23,7 +23,7 @@ YawPull = declare(
         plausible=Plausible(-0.5, 0.5, "a curve of 2 m radius where a straight line is commanded"),
     ),
     rank=10,
-    kinds=("omni", "mecanum"),
+    kinds=("mecanum", "omni"),
     needs=(Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD),
     confused_with=("wheel_asymmetry", "yaw_drift"),
 )
