@@ -210,7 +210,7 @@ def list_trials(fit: PathFit, candidate: Candidate, largest: Largest) -> Iterato
         yield Trial(start, tuple(direct), stack_columns(columns), replaces=replaces)
     parts = [effect for effect in fit.state.effects if effect.id in replaces]
     if (values := inherit(candidate.parameters, parts)) and not any(map(fit.state.has_own, replaces)):
-        yield _start_at_parts(fit, candidate(**values), state, replaces)
+        yield _start_at_parts(fit, candidate().change_within(**values), state, replaces)
 
 
 def inherit(parameters: Sequence[Parameter], parts: Sequence[Effect]) -> dict[str, float]:

@@ -32,7 +32,7 @@ from pipeline.estimation.estimates import (
     was_aligned,
 )
 from pipeline.estimation.ladder import ModelAssessment, assess_model, list_order, note_fit
-from pipeline.estimation.plausibility import measure_moves
+from pipeline.estimation.plausibility import measure_moves, note_unusual
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
 from pipeline.results import (
@@ -155,6 +155,7 @@ def summarize(
         unexplained=_find_unexplained(results, region) if suggestion is None else suggestion.unexplained,
         findings=(
             *note_cut(body.search.budget),
+            *note_unusual(named),
             *(() if assessment is None else find_change(assessment)),
         ),
         ladder=() if assessment is None else assessment.ladder.as_result(assessment.floor),

@@ -32,7 +32,7 @@ from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.matrix import Change, Matrix
 from pipeline.estimation.model_state import combine_columns, pick_columns
 from pipeline.estimation.noise import huber_cost
-from pipeline.estimation.plausibility import is_nameable, is_too_small
+from pipeline.estimation.plausibility import is_nameable, is_possible, is_too_small
 from pipeline.models import Search as HowSearched
 
 if TYPE_CHECKING:
@@ -235,8 +235,8 @@ class Search:
 
     def _is_impossible(self, fit: PathFit, effect: Effect) -> bool:
         acting = _list_acting(fit, effect)
-        is_possible = any(is_nameable(one, self.conditions) for one in acting) or self._is_small(fit, effect)
-        return effect.id not in self.given and not is_possible
+        may_be = any(is_possible(fit, one, self.conditions) for one in acting) or self._is_small(fit, effect)
+        return effect.id not in self.given and not may_be
 
     def _is_small(self, fit: PathFit, effect: Effect) -> bool:
         """Whether only its size keeps an effect from a name: it stays, as others would only imitate it."""
@@ -434,7 +434,7 @@ class Search:
             same = {name: effect.values[name] for name in names & {*effect.values}}
             taus = [value for name, value in effect.values.items() if name.startswith("tau")]
             if names == {*same} and all(map(math.isfinite, same.values())):
-                yield candidate(**same)
+                yield candidate().change_within(**same)
             elif names == {"tau"} and taus:
                 yield candidate(tau=sum(taus) / len(taus))
 
@@ -614,7 +614,7 @@ def judge(
     refusal, is_proven, acting = "", False, _list_acting(fit, effect)
     if t < least_t:
         refusal = f"it is not significant: t = {t:.1f}, required {least_t:.2g}"
-    elif not any(is_nameable(one, conditions) for one in acting):
+    elif not any(is_possible(fit, one, conditions) for one in acting):
         is_small = all(is_too_small(one, conditions) for one in acting)
         refusal = (
             "it is smaller than data sheets and stamps err" if is_small else "its values are not possible"

@@ -3,20 +3,67 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.models import OVERSHOOT, Conditions, Effect, Parameter
-from pipeline.results import Moves
+from pipeline.models import OVERSHOOT, Conditions, Effect, Parameter, find_effect
+from pipeline.recording import Finding
+from pipeline.results import Moves, Named
 
 if TYPE_CHECKING:
+    from pipeline.estimation.fit import PathFit
     from pipeline.estimation.model_fit import Fitted
 
 _AT_BOUND = 1e-3
 """Fraction of a parameter's range; a value closer than this to a bound is at the bound."""
 _UNCERTAIN = 1.5
 """Multiple of a limit's value at which its interval may end: it is not known during a search."""
+
+_PROVEN_T = 20.0
+"""Standard errors beyond the observed range at which a value counts all the same: that range is what was seen
+before, not what can be."""
+
+
+def is_possible(fit: PathFit, effect: Effect, conditions: Conditions) -> bool:
+    """Whether an effect can be named: its values are plausible, or proven to be beyond what was observed."""
+    if is_nameable(effect, conditions):
+        return True
+    wild = list_implausible(effect)
+    ends = {one.name: one.nearest_plausible(effect.values[one.name]) for one in wild}
+    inside = effect.change(**ends)
+    if not wild or not is_nameable(inside, conditions) or is_exceeded(effect, conditions):
+        return False
+    errors = np.sqrt(np.diag(fit.covariance))
+    numbers = [number for number in fit.free if number.effect == effect.id]
+    return all(
+        not _is_at_bound(effect.values[name], effect.parameter(name))
+        and any(number.name == name and number.is_smooth for number in numbers)
+        and all(
+            abs(effect.values[name] - end) > _PROVEN_T * float(error)
+            for number, error in zip(fit.free, errors, strict=True)
+            if number in numbers and number.name == name
+        )
+        for name, end in ends.items()
+    )
+
+
+def note_unusual(effects: Iterable[Named]) -> list[Finding]:
+    """A finding for each named effect with a value beyond what was observed."""
+    findings = []
+    for named in effects:
+        known = find_effect(named.id)
+        for p in known.parameters:
+            value = named.parameters[p.name].value if p.name in named.parameters else p.neutral
+            if p.plausible is None or not math.isfinite(value):
+                continue
+            low, high = p.plausible.low, p.plausible.high
+            if low <= value <= high:
+                continue
+            values = {"value": value, "parameter": p.name, "unit": p.unit, "low": low, "high": high}
+            findings.append(Finding("unusual_value", "warning", named.id, values))
+    return findings
 
 
 def is_nameable(effect: Effect, conditions: Conditions) -> bool:

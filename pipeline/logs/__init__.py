@@ -44,7 +44,7 @@ from pipeline.logs.index import (
 )
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics
-from pipeline.logs.records import LATEST_NS, ROS1_BAG, SQLITE_BAG, LogError, Loss
+from pipeline.logs.records import LATEST_NS, OTHER_VERSION, ROS1_BAG, SQLITE_BAG, LogError, Loss
 from pipeline.logs.remote import RemotePath, locate_recorded, open_store, spell_location, to_location
 from pipeline.logs.schema import bundled_types, definition_text, short_name
 

@@ -412,16 +412,24 @@ def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
     values: dict[str, Value] = {}
     for declared in descriptor.fields:
         value = getattr(message, declared.name)
+        if (within := declared.containing_oneof) is not None and within.name == f"_{declared.name}":
+            # What is declared as optional, and not set, is missing rather than zero.
+            value = value if _is_set(message, declared.name) else None
         if isinstance(value, str | bytes | bool | int | float):
             values[declared.name] = _plain(value)
         elif hasattr(type(value), "DESCRIPTOR"):
             # Unset fields are read as their defaults, which would not terminate in a recursive type.
-            is_set = type(message).HasField(message, declared.name)  # type: ignore[attr-defined]
+            is_set = _is_set(message, declared.name)
             if is_set or declared.message_type.full_name not in inside:
                 values[declared.name] = _plain(value, inside)
-        elif not hasattr(value, "items"):
+        elif value is not None and not hasattr(value, "items"):
             values[declared.name] = [_plain(each, inside) for each in value]
     return values
+
+
+def _is_set(message: object, name: str) -> bool:
+    """Whether a field of a protobuf message is set."""
+    return bool(type(message).HasField(message, name))  # type: ignore[attr-defined]
 
 
 def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, list[Leaf | None], bool]]:
@@ -461,11 +469,13 @@ class Recipe:
         decoder: the decoder.
         leaves: all leaf fields of the type; empty if they are known only from the messages.
         notes: remarks for the user.
+        is_bundled: whether the definition is not from the log.
     """
 
     decoder: StructuredDecoder | ObjectDecoder
     leaves: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    is_bundled: bool = False
 
 
 def decoder_for(
@@ -498,16 +508,9 @@ def decoder_for(
     leaves = tuple(leaf_paths(structure))
     chosen = select_leaves(leaves, fields, optional, where=origin)
     chosen |= {path for path in _STAMP if path in leaves}
-    return Recipe(
-        StructuredDecoder(
-            structure,
-            chosen,
-            info.message_encoding,
-            exact=bool(notes and structure.members),
-        ),
-        leaves,
-        notes,
-    )
+    is_bundled = bool(notes and structure.members)
+    decoder = StructuredDecoder(structure, chosen, info.message_encoding, exact=is_bundled)
+    return Recipe(decoder, leaves, notes, is_bundled)
 
 
 def _structure_of(

@@ -26,6 +26,7 @@ from pipeline.logs.bags import catalog_bag
 from pipeline.logs.catalog import Catalog, keep_within
 from pipeline.logs.chunks import Span, SpanKind
 from pipeline.logs.compressed import COMPRESSED, open_inflated
+from pipeline.logs.foreign import LONGEST_START, name_foreign
 from pipeline.logs.records import (
     LONGEST_HEAD,
     LONGEST_MAGIC,
@@ -271,7 +272,7 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> None:
     if head == rec.MAGIC:
         return
     what = "this is not an MCAP file or a ROS bag"
-    hint = "Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)"
+    hint = "Give an .mcap, .bag or .db3 file: others are first converted to one of these"
     if head.startswith(b"\x89MCAP0\n"):
         what = "a copy in text mode changed line ends of the file, and with them its data"
         hint = "Copy the file again in binary mode"
@@ -281,6 +282,8 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> None:
     elif _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
         what = "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file"
         hint = "Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer"
+    elif foreign := name_foreign(source.read_at(0, LONGEST_START)):
+        what, hint = foreign
     raise LogError("not_mcap", what, where=source.name, hint=hint)
 
 

@@ -36,7 +36,7 @@ from pipeline.logs.columns import (
 from pipeline.logs.decode import take_rows
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
 from pipeline.logs.part import count_fetched, hash_sources, open_source
-from pipeline.logs.records import SQLITE_BAG, ByteSource, LogError, Loss
+from pipeline.logs.records import OTHER_VERSION, SQLITE_BAG, ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
 from pipeline.logs.spans import Loaded, load_spans
 
@@ -51,6 +51,9 @@ class Wanted:
             ``transforms[].child_frame_id``; a path of a structure selects all its fields. None selects all.
         alike: by other types of the topic (``package/Name``), their own paths of the fields; channels of
             these types are read as if they were of the first.
+        layouts: paths of the fields in the layouts that the type has had, the present one first: the first
+            that the definition in the log has is read as if it were the present one. None of a type that is
+            not known.
         optional: those of the fields that a topic may lack, such as JSON messages without them: there is no
             column of them then.
     """
@@ -59,6 +62,7 @@ class Wanted:
     fields: tuple[str, ...] | None = None
     alike: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     optional: frozenset[str] = frozenset()
+    layouts: tuple[Mapping[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,12 +270,11 @@ def _choose_channels(
         plain = {info.id: short_name(info.type_name.replace(".", "/")) for info in infos}
         for info in infos:
             own = want.alike.get(plain[info.id], {})
-            fields = tuple(own.values()) if own else want.fields
-            optional = {own.get(path, path) for path in want.optional}
             name = types[topic] if own else info.type_name
             try:
-                recipe = decoder_for(info, schemas[info.id], fields, optional, where=str(index.path))
-                spelled = {path: wanted for wanted, path in own.items()}
+                paths, recipe = _fit_layout(info, schemas[info.id], want, own, str(index.path))
+                fields = None if want.fields is None else tuple(paths.values())
+                spelled = {path: wanted for wanted, path in paths.items()}
                 jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields, spelled, name)
             except LogError as error:
                 errors.append(error)
@@ -291,6 +294,52 @@ def _choose_channels(
     return jobs
 
 
+def _fit_layout(
+    info: ChannelInfo, schema: bytes, want: Wanted, own: Mapping[str, str], where: str
+) -> tuple[Mapping[str, str], Recipe]:
+    """The path of each wanted field in the first layout that a channel's definition has, and its decoder.
+
+    Args:
+        info: the channel.
+        schema: data of its schema.
+        want: the request.
+        own: paths of a type that is alike; empty for the topic's own type.
+        where: log named in errors.
+
+    Raises:
+        LogError: as `decoder_for`.
+    """
+    if want.fields is None:
+        return {}, decoder_for(info, schema, None, where=where)
+    known: Mapping[str, str] = want.layouts[0] if want.layouts else {}
+    missing: LogError | None = None
+    for layout in [own] if own else want.layouts or [known]:
+        paths = dict(own) or {
+            path: layout.get(path, path) for path in want.fields if path in layout or path not in known
+        }
+        optional = {paths.get(path, path) for path in want.optional}
+        try:
+            return paths, decoder_for(info, schema, tuple(paths.values()), optional, where=where)
+        except LogError as error:
+            if error.code != "field_not_found":
+                raise
+            missing = missing or error
+    if missing is None:
+        raise AssertionError
+    if not known:
+        raise missing
+    with suppress(LogError):
+        decoder_for(info, schema, tuple(known), want.optional, where=where)
+        # What is missing is a field that the user named.
+        known = {}
+    if not known:
+        raise missing
+    package = info.type_name.partition("/")[0]
+    what = f"the log defines {info.type_name} as another version of {package} than is known here does"
+    hint = f"{missing.hint}. Name the fields by their paths, for example [pose] x, y and yaw in run.toml"
+    raise LogError(missing.code, what, where=missing.where, hint=hint)
+
+
 def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, Wanted]:
     """Requests by topic; a topic that is wanted twice has the fields of both requests."""
     merged: dict[str, Wanted] = {}
@@ -308,7 +357,10 @@ def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, Wanted]:
                 for name, paths in before.alike.items()
                 if name in want.alike
             }
-            merged[want.topic] = Wanted(want.topic, fields, alike, frozenset(fields) - needed)
+            layouts = tuple(
+                {**one, **other} for one, other in zip(before.layouts, want.layouts, strict=False)
+            )
+            merged[want.topic] = Wanted(want.topic, fields, alike, frozenset(fields) - needed, layouts)
     return merged
 
 
@@ -420,6 +472,13 @@ def _find_repeated(
     return repeated
 
 
+_OTHER_VERSION: Final = (
+    "the log does not hold the definition of {kind}, and the messages are of another version of {package} "
+    "than the definition that is known here: record to MCAP, which holds the definitions (`ros2 bag record "
+    "-s mcap`), or convert the log to MCAP where that version of {package} is installed (`ros2 bag convert`)"
+)
+
+
 def _finish(job: _Job, repeated: Mapping[int, Ints], *, skip_unfit: bool) -> tuple[TopicColumns, list[Loss]]:
     repeated_rows = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
     log_time, publish_time, rows = job.buffer.finish(repeated_rows)
@@ -437,8 +496,14 @@ def _finish(job: _Job, repeated: Mapping[int, Ints], *, skip_unfit: bool) -> tup
     losses = []
     for rejected in job.recipe.decoder.rejected:
         start, end = job.buffer.times_of(rejected.rows)
-        text = f"{rejected.rows.size} messages of {job.info.topic}: {rejected.reason}"
-        losses.append(Loss(rejected.kind, text, rejected.bytes, 0, start, end))
+        kind, reason = rejected.kind, rejected.reason
+        if job.recipe.is_bundled and rejected.rows.size == job.buffer.count:
+            kind, reason = (
+                OTHER_VERSION,
+                _OTHER_VERSION.format(kind=job.info.type_name, package=job.info.type_name.partition("/")[0]),
+            )
+        text = f"{rejected.rows.size} messages of {job.info.topic}: {reason}"
+        losses.append(Loss(kind, text, rejected.bytes, 0, start, end))
     for field_path, count in job.recipe.decoder.shortened.items():
         text = (
             f"{count} strings in {field_path} of {job.info.topic} are longer than {MAX_TEXT} bytes: cut there"

@@ -29,6 +29,10 @@ def unsupported(what: str, where: str, hint: str = "Leave the topic out") -> Log
     return LogError("unsupported_encoding", what, where=where, hint=hint)
 
 
+OTHER_VERSION: Final = "other_version"
+"""Kind of the loss of messages of another version of their type than the definition that is known."""
+
+
 @dataclass(frozen=True, slots=True)
 class Loss:
     """Part of a log that could not be read completely.

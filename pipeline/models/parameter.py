@@ -353,6 +353,11 @@ class Parameter:
         rounded = round_digits(value, digits)
         return rounded if low <= rounded <= high and value != self.neutral else value
 
+    def nearest_plausible(self, value: float) -> float:
+        """The value of the observed range that is nearest to a value; that itself without such a range."""
+        shown = self.plausible
+        return value if shown is None else min(max(value, shown.low), shown.high)
+
     def is_physical(self, value: float, error: float) -> bool:
         """Whether an estimate can be physics: within bounds, and within its error in the physical range.
 

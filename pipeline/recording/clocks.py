@@ -66,6 +66,14 @@ _CLOSED_NS = 10_000_000_000
 waits and holds of a drive, so that nothing crosses it."""
 _HOLE_NS = 1_000_000_000
 """Gap [ns] above which a line is interrupted: bridges delay messages by less."""
+_TICKS_NS = tuple(
+    round(tick * 1e9) for tick in (60.0, 10.0, 1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.04, 0.02, 0.01)
+)
+"""Resolutions [ns] of clocks that are read too coarsely, the coarsest first."""
+_ON_TICK_NS = 20_000
+"""Distance [ns] of a stamp from a multiple of its clock's resolution: decimals in a double are as near."""
+_TOO_COARSE = 2.5
+"""Periods of a topic that a resolution lasts from which on stamps do not tell its messages apart."""
 _REACH = 25
 """Messages on each side for a line: fifty include several bunches of ten."""
 
@@ -129,11 +137,12 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     Raises:
         StageError: ``no_clock``, the chosen time of a topic stands still.
     """
+    recorded, coarse = _leave_coarse_stamps(recorded)
     pauses = find_pauses(times.log_time for times in recorded.values())
     recorded, simulated = _follow_simulated_time(_close_pauses(recorded, pauses))
     recorded, drifts = _take_off_drift(recorded)
     recorded, bunches = _spread_bunches(recorded)
-    findings = simulated + drifts + bunches
+    findings = coarse + simulated + drifts + bunches
     if pauses:
         longest, count = max(after - last for last, after in pauses) / 1e9, len(pauses)
         values = {"kind": "pause of topics in use", "value": longest, "count": count}
@@ -152,6 +161,33 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     shifted, joined = _join_time_bases(clocks)
     single, repeated = drop_repeated_stamps(shifted)
     return single, findings + joined + repeated
+
+
+def _leave_coarse_stamps(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
+    """Topics without stamps that are too coarse for their rate: these are no times of their messages."""
+    plain, findings = dict(recorded), []
+    for key, times in recorded.items():
+        tick = _find_tick_ns(times)
+        if not tick:
+            continue
+        plain[key] = replace(times, header_time=None)
+        period = float(np.median(np.diff(times.log_time))) / 1e9
+        values = {"value": tick / 1e9, "period_s": period}
+        findings.append(Finding("coarse_stamps", "warning", times.topic, values))
+    return plain, findings
+
+
+def _find_tick_ns(times: Recorded) -> int:
+    """Resolution of a topic's stamps [ns], where it is too coarse for its rate; zero otherwise."""
+    header, log = times.header_time, times.log_time
+    if header is None or times.clock is not None or not times.is_stamped or log.size < _FEWEST_OF_PACE:
+        return 0
+    period, distinct = float(np.median(np.diff(log))), np.unique(header).size
+    if period <= 0.0 or distinct * _TOO_COARSE > log.size:
+        return 0
+    off = ((header + tick // 2) % tick - tick // 2 for tick in _TICKS_NS)
+    ticks = zip(_TICKS_NS, (float(np.quantile(np.abs(one), _USUAL_SHARE)) for one in off), strict=True)
+    return next((tick for tick, far in ticks if far <= _ON_TICK_NS and tick > _TOO_COARSE * period), 0)
 
 
 def _require_advance(clock: TopicClock) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core import Flags, Floats, spread_equal
+from pipeline.core import Flags, Floats
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.recording import topic_values
 from pipeline.recording.findings import Finding, StageError
-from pipeline.run import LIVE_SHARE
+from pipeline.recording.rates import differentiate_angle, report_jumps, settle_joints, unwrap_counter
 from pipeline.sources import (
     DriveForm,
     DriveSection,
@@ -22,7 +22,6 @@ from pipeline.sources import (
     Vehicle,
     convert_unit,
     find_type,
-    list_factors,
     list_ranges,
 )
 
@@ -38,14 +37,6 @@ _USUAL_UNITS = {
     DriveForm.BODY: ("m/s", "rad/s"),
     DriveForm.STEERING: ("m/s", "rad"),
 }
-_UNIT_NEAR = 0.1
-"""Relative tolerance of a gain around a unit's factor: positions and velocities of one wheel do not depend on
-the ground, and units differ by a factor of 6 at least."""
-_STILL_RADPS = 0.05
-"""Rate [rad/s] below which a wheel is at rest; a wheel at rest in the whole log does not show a unit."""
-_COUNTERS = (2.0**16, 2.0**32)
-"""Numbers of ticks after which encoder counters wrap around."""
-
 
 SIGNALS = ("left", "right", "speed", "steering", "sideways", "body_x", "body_y", "body_w")
 """Signals of a drive, in the order of the tables' columns: speeds of the left and the right wheels [rad/s];
@@ -83,9 +74,10 @@ def read_joints(
         if not _is_known(joint, position, velocity):
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
+    findings += report_jumps(columns.topic, times, {joint: position[joint] for joint in missing})
     recorded = [joint for joint in (*left, *right) if joint not in missing]
-    section, converted = _convert_unit(columns.topic, times, section, velocity, position, recorded)
-    findings += converted
+    section, settled = _settle(columns.topic, times, section, velocity, position, recorded)
+    findings += settled
     velocity |= {
         joint: velocity[joint] * _find_factor(section, side, joint)
         for side, joints_of_it in chosen.items()
@@ -132,21 +124,31 @@ def _find_factor(section: DriveSection, side: str, joint: str = "") -> float:
     return factors.get(side, 1.0) * factors.get(joint, 1.0) * (-1.0 if section.reversed == side else 1.0)
 
 
-def _convert_unit(
+def _settle(
     topic: str,
     times: Floats,
     section: DriveSection,
-    velocity: Mapping[str, Floats],
+    velocity: dict[str, Floats],
     position: Mapping[str, Floats],
     joints: Sequence[str],
 ) -> tuple[DriveSection, list[Finding]]:
-    """The section with the unit in which velocities are what positions turn, unless it gives one."""
+    """The section with the unit of the velocities, unless it gives one; rates of positions replace some.
+
+    Velocities that are zero, or contradict what the positions of the same joints turn, are replaced.
+    """
     both = [joint for joint in joints if _is_known(joint, position, velocity)]
-    unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
-    if section.unit is not None or not unit:
+    if section.unit is not None or not both:
         return section, []
-    finding = Finding("unit_wrong", "warning", topic, {"kind": "of positions", "unit": unit})
-    return structs.replace(section, unit=unit), [finding]
+    turned = {joint: differentiate_angle(times, position[joint]) for joint in both}
+    settled = settle_joints(topic, {joint: velocity[joint] for joint in both}, turned)
+    velocity |= {joint: turned[joint] for joint in settled.by_position}
+    findings = list(settled.findings)
+    if settled.by_position:
+        findings += report_jumps(topic, times, {joint: position[joint] for joint in settled.by_position})
+    if not settled.unit or len(both) < len(joints):
+        return section, findings
+    findings.append(Finding("unit_wrong", "warning", topic, {"kind": "of positions", "unit": settled.unit}))
+    return structs.replace(section, unit=settled.unit), findings
 
 
 def _mean_sideways(
@@ -167,31 +169,6 @@ def _mean_sideways(
         parts.append(speed if is_front != (joint in left_joints) else -speed)
     mean: Floats = np.mean(parts, axis=0)
     return mean
-
-
-def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> str | None:
-    """Unit of velocities that differ from the rates of their positions in rad/s; None if they agree.
-
-    A unit is recognized only if the gain is constant and equals the unit's factor.
-    """
-    gains = []
-    for velocity, position in joints:
-        turned = differentiate_angle(times, position)
-        live = np.isfinite(turned) & np.isfinite(velocity)
-        live &= np.abs(turned) > LIVE_SHARE * float(
-            np.max(np.abs(turned[live]), initial=_STILL_RADPS / LIVE_SHARE)
-        )
-        if live.sum() < topic_values.FEWEST_MESSAGES:
-            return None
-        ratio = velocity[live] / turned[live]
-        gain = float(np.median(ratio))
-        if float(np.median(np.abs(ratio - gain))) > _UNIT_NEAR * abs(gain):
-            return None
-        gains.append(gain)
-    for unit, factor in list_factors("rad/s").items():
-        if gains and all(abs(one * factor - 1.0) < _UNIT_NEAR for one in gains):
-            return unit
-    return None
 
 
 def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
@@ -225,7 +202,7 @@ def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Fl
         raise _no_wheels(columns.topic, ())
     if not joints.interfaces:
         velocity, position = (
-            _joint_matrix(columns.fields[field], names) for field in (joints.velocity, joints.position)
+            _joint_matrix(columns.fields.get(field), names) for field in (joints.velocity, joints.position)
         )
         return velocity, position
     interfaces, values = columns.fields[joints.interfaces], columns.fields[joints.values]
@@ -249,7 +226,11 @@ def read_rates(columns: TopicColumns, times: Floats) -> dict[str, Floats]:
         times: time of each message [s].
     """
     velocity, position = _read_series(columns)
-    rates = {name: rate for name, rate in velocity.items() if _is_known(name, velocity, position)}
+    rates = {
+        name: rate
+        for name, rate in velocity.items()
+        if _is_known(name, velocity, position) and (np.any(rate[np.isfinite(rate)]) or name not in position)
+    }
     return rates | {
         name: differentiate_angle(times, angle) for name, angle in position.items() if name not in rates
     }
@@ -349,22 +330,6 @@ def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
     )
 
 
-def differentiate_angle(times: Floats, angle: Floats) -> Floats:
-    """Rate [rad/s] of a wheel angle [rad] by central differences between readings, NaN where there is none.
-
-    A wrapped angle is unwrapped.
-    """
-    rate = np.where(np.isfinite(angle), 0.0, np.nan)
-    known = np.isfinite(angle)
-    if known.sum() < 3:  # noqa: PLR2004 - a central difference needs neighbours
-        return rate
-    series, times = angle[known], times[known]
-    if float(np.max(np.abs(np.diff(series)))) > np.pi and np.ptp(series) <= 2.0 * np.pi + 1e-6:
-        series = np.unwrap(series)
-    rate[known] = np.gradient(series, spread_equal(times))
-    return rate
-
-
 def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats:
     scale, offset, unit = convert_unit(section.unit or "rad/s", vehicle.units, where="wheels")
     return (values - offset) * scale * section.sign / (vehicle.wheel_radius_m if unit == "m/s" else 1.0)
@@ -417,14 +382,6 @@ def is_angle(source: DriveSource, section: DriveSection) -> bool:
     """Whether the signals of a pair are wheel angles, to be differentiated."""
     unit = section.unit or source.signals[0].unit
     return source.form is DriveForm.SIDES and unit in {"rad", "deg", "ticks"}
-
-
-def unwrap_counter(count: Floats) -> Floats:
-    """Unwrap a counter that wraps around at 2^16 or 2^32."""
-    for period in _COUNTERS:
-        if count.size > 1 and np.ptp(count) <= period and np.abs(np.diff(count)).max() > 0.5 * period:
-            return np.asarray(np.unwrap(count, period=period), dtype=np.float64)
-    return count
 
 
 def read_pair(

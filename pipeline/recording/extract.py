@@ -16,7 +16,6 @@ from pipeline.recording import pose_topics, topic_values
 from pipeline.recording.clocks import Recorded, TopicClock, align_clocks, find_pauses
 from pipeline.recording.drive import (
     SIGNALS,
-    differentiate_angle,
     interpolate_readings,
     is_angle,
     is_of_wheels,
@@ -31,6 +30,7 @@ from pipeline.recording.findings import Finding, StageError, blame_damage
 from pipeline.recording.log_columns import LogColumns
 from pipeline.recording.lost_messages import fill_gaps
 from pipeline.recording.pose_topics import read_bodies
+from pipeline.recording.rates import differentiate_angle, report_jumps
 from pipeline.recording.tilt import lean
 from pipeline.recording.topic_values import Span, find_spans_given, find_spans_of_state, is_inside
 from pipeline.sources import (
@@ -164,9 +164,9 @@ class Extraction:
         )
         self.findings += [self._report_left_out(one) for one in unfit if one.topic in used]
         pose = sources.pose
-        drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
+        self._drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
         self.chain = (
-            pose_topics.chain_poses(topics, pose, self.where, drive=drive)
+            pose_topics.chain_poses(topics, pose, self.where, drive=self._drive)
             if pose and pose.from_transforms
             else None
         )
@@ -361,7 +361,7 @@ class Extraction:
                 chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
             )
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += pose_topics.report_chain(chain, source)
+            self.findings += pose_topics.report_chain(chain, source, self.data.topics, self._drive)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:
@@ -691,7 +691,9 @@ class Extraction:
             columns, clock, order = self._require(signal.topic, held=held)
             values = read_signal(columns, source, number, section, vehicle)[order]
             if is_angle(source, section):
-                values = differentiate_angle(self._seconds(clock.stamp[order]), values)
+                times = self._seconds(clock.stamp[order])
+                self.findings += report_jumps(signal.topic, times, {str(signal): values})
+                values = differentiate_angle(times, values)
             series.append((clock.stamp[order], columns.log_time[order], values))
         (first, log_first, a), (second, log_second, b) = series
         if np.array_equal(first, second):

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import msgspec
 
 from pipeline.core import SlipError
-from pipeline.logs import OVER_BUDGET, Loss
+from pipeline.logs import OTHER_VERSION, OVER_BUDGET, Loss
 
 SURE = 5.0
 """Significance threshold [standard errors] for reporting a difference: of a thousand runs without one, normal
@@ -28,6 +28,8 @@ def blame_damage(losses: Sequence[Loss]) -> str:
     if not losses:
         return ""
     why = "not all of the log is read" if losses[0].kind in _BOUNDS else "the log is damaged"
+    if losses[0].kind == OTHER_VERSION:
+        return f" ({losses[0].text}{others})"
     return f" ({why}: {losses[0].text}{others})"
 
 

@@ -161,7 +161,11 @@ def require_sources(chosen: Choice, index: LogIndex, options: LogOptions) -> Non
 
 def _suggest_pose(index: LogIndex) -> str:
     """Topics whose fields look like poses, and the lines that use them; empty if there are none."""
-    by_topic = {topic: find_pose_fields(topic, fields) for topic, fields in list_fields(index).items()}
+    by_topic = {
+        topic: find_pose_fields(topic, fields)
+        for topic, fields in list_fields(index).items()
+        if plain_type(index.types[topic]).partition("/")[0] not in _KNOWN_PACKAGES
+    }
     lines = [
         "{} looks like a pose, of a type that is not known; to use it, in run.toml: [pose] {}".format(
             topic,

@@ -2,7 +2,8 @@
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -339,7 +340,8 @@ def chain_poses(
     """Poses of base_link along the chain of transforms.
 
     Without configured frames the child is base_link (or base_footprint, base), else the only frame that
-    moves, or the only one in the namespace of the drive; the parent is the first of map, world and odom among
+    moves, or the only one in the namespace of the drive; of several robots it is that of the drive's
+    namespace, or else the first. The parent is the first of map, world and odom among
     the child's ancestors, else its topmost ancestor.
 
     Args:
@@ -362,16 +364,29 @@ def chain_poses(
 def _choose_frames(buffer: TransformBuffer, where: str, drive: str) -> tuple[str, str]:
     parents = {link.child: link.parent for link in buffer.links()}
     frames = buffer.frames()
-    bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
+    bases = _list_bases(frames, drive)
     child = bases[0] if bases else _find_moving_frame(buffer, where, drive)
-    above = [child]
-    while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
-        above.append(parents[above[-1]])
+    above = _climb(parents, child)
     named = [frame for fixed in _FIXED for frame in above[1:] if frame.rsplit("/", 1)[-1] == fixed]
     if not named and len(above) == 1:
         hint = f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}."
         raise StageError("no_base_frame", f"the transforms give {child} no parent", where=where, hint=hint)
     return (named[0] if named else above[-1]), child
+
+
+def _list_bases(frames: Sequence[str], drive: str) -> list[str]:
+    """Frames of bases, those of the robot in whose namespace the drive is first."""
+    spaces = drive.strip("/").split("/")[:-1]
+    prefixed = {f"{space}_{base}" for space in spaces for base in _BASES}
+    bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
+    bases += [frame for frame in frames if frame.rsplit("/", 1)[-1] in prefixed]
+    # The base of an arm on a robot has a longer name than its own.
+    return sorted(bases, key=lambda frame: (not _is_within(frame, spaces), frame.count("/")))
+
+
+def _is_within(frame: str, spaces: Sequence[str]) -> bool:
+    """Whether a frame is of a robot in one of the namespaces, by its prefix."""
+    return any(space in frame.split("/")[:-1] or frame.startswith(f"{space}_") for space in spaces)
 
 
 def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
@@ -395,10 +410,20 @@ def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
     return chosen[0]
 
 
-def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
-    """Findings on a chain."""
+def report_chain(
+    series: TransformSeries, source: PoseSource, topics: Sequence[TopicColumns], drive: str
+) -> list[Finding]:
+    """Findings on a chain.
+
+    Args:
+        series: the chain.
+        source: the choice, with frames if configured.
+        topics: all topics that were read.
+        drive: topic of the drive.
+    """
     topic = source.topic
     findings = [Finding("transforms", "info", topic, {"parent": series.parent, "child": series.child})]
+    findings += [] if source.frames else _report_robots(series.child, topics, topic, drive)
     if source.frames is None and series.child.rsplit("/", 1)[-1] not in _BASES:
         findings.append(Finding("vehicle_frame", "info", topic, {"frame": series.child}))
     if series.parent.rsplit("/", 1)[-1] == "odom":
@@ -406,6 +431,40 @@ def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
     if (often := rigid.measure_period(1e-9 * series.time[series.corrected].astype(np.float64))) > _SPARSE_S:
         findings.append(Finding("sparse_corrections", "info", topic, {"period_s": often}))
     return findings + [Finding("transform_note", "info", topic, {"note": note}) for note in series.notes]
+
+
+def _report_robots(child: str, topics: Sequence[TopicColumns], topic: str, drive: str) -> list[Finding]:
+    """A finding where the transforms are of several robots: which one is taken, and why."""
+    buffer = TransformBuffer([one for one in topics if is_transforms(one)])
+    parents = {link.child: link.parent for link in buffer.links()}
+    bases = [frame for frame in _list_bases(buffer.frames(), drive) if _end_of(frame) == _end_of(child)]
+    # The base of an arm on the robot is below its own.
+    others = [frame for frame in bases if child not in _climb(parents, frame)]
+    if not others:
+        return []
+    is_own = _is_within(child, drive.strip("/").split("/")[:-1])
+    values = {
+        "kind": "of the command" if is_own else "undecided",
+        "frames": sorted((child, *others)),
+        "child": child,
+        "drive": drive,
+        "count": 1 + len(others),
+    }
+    return [Finding("several_robots", "info" if is_own else "warning", topic, values)]
+
+
+def _end_of(frame: str) -> str:
+    """The base's own name at the end of a frame's."""
+    name = frame.rsplit("/", 1)[-1]
+    return next((base for base in _BASES if name == base or name.endswith(f"_{base}")), name)
+
+
+def _climb(parents: Mapping[str, str], frame: str) -> list[str]:
+    """A frame and all above it."""
+    above = [frame]
+    while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
+        above.append(parents[above[-1]])
+    return above
 
 
 def report_frame(topic: str, parent: str) -> list[Finding]:
@@ -469,9 +528,11 @@ def find_turn(topics: Sequence[TopicColumns], frame: str) -> Floats | None:
 def _find_base(topics: Sequence[TopicColumns], child: str) -> tuple[str, TransformSeries | None]:
     """The base's frame and its pose in a frame of the vehicle; None without a chain of static transforms."""
     buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
-    base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
-    try:
-        offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64)) if base else None
-    except LogError:
-        offset = None
-    return base, offset if offset is not None and offset.position.shape[0] else None
+    # Of several robots, static transforms lead to the base of the child's own.
+    bases = [frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]]
+    for base in bases:
+        with suppress(LogError):
+            offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64))
+            if offset.position.shape[0]:
+                return base, offset
+    return next(iter(bases), ""), None

@@ -29,7 +29,7 @@ from pipeline.sources import (
     Sources,
     find_type,
 )
-from pipeline.sources.message_types import find_alike
+from pipeline.sources.message_types import find_alike, list_layouts
 
 _LARGEST = 1e12
 """Largest number in SI units, above any position, angle, speed and acceleration; its powers stay finite."""
@@ -208,10 +208,10 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
         axes = (*axis_fields(pose.position, "xyz"), *_turn_fields(pose))
         named = (*axes, pose.parent, pose.child, pose.names)
         return [*(Signal(source.topic, name) for name in named if name), *source.headings]
-    fields = [Signal(source.topic, _FRAME), *source.headings]
+    fields = [Signal(source.topic, _frame_field(types[source.topic])), *source.headings]
     if kind.fix is not None:
         names = (kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status)
-        fields += [Signal(source.topic, name) for name in names]
+        fields += [Signal(source.topic, name) for name in names if name]
     for topic in (source.topic, source.velocity):
         velocity = find_type(types.get(topic, "")).ground_velocity
         if velocity is not None:
@@ -225,6 +225,9 @@ def _fields_of(source: DriveSource | PoseSource, types: dict[str, str]) -> list[
 
 def _list_optional(source: DriveSource | PoseSource, types: dict[str, str]) -> list[Signal]:
     """Fields that a topic in this role may lack, as JSON messages do: height, sideways speed, frames."""
+    if isinstance(source, DriveSource) and source.form is DriveForm.JOINTS:
+        # Of joints, velocities or positions are enough.
+        return drive_fields(source, types)[1:]
     if isinstance(source, DriveSource):
         sideways = sideways_field(source, types)
         return [] if sideways is None else [sideways]
@@ -278,6 +281,7 @@ def list_wanted(
             _recorded_fields(types[topic], fields),
             find_alike(types[topic], fields),
             frozenset((*_stamp_fields(types[topic]), *(one.field for one in beside if one.topic == topic))),
+            list_layouts(types[topic], _recorded_fields(types[topic], fields)),
         )
         for topic, fields in by_topic.items()
     ]
@@ -542,9 +546,10 @@ def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
     fix = find_type(columns.type_name).fix
     if fix is None:
         raise _holds_no("fix", columns, "pose")
-    latitude, longitude, altitude, status = (
-        numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
+    latitude, longitude, altitude = (
+        numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude)
     )
+    status = numbers(columns, fix.status) if fix.status else np.zeros(latitude.size)
     # A receiver without a fix may report zero and zero, in the Gulf of Guinea.
     there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)
     there &= (latitude != 0.0) | (longitude != 0.0)
@@ -569,7 +574,13 @@ def read_attitude(columns: TopicColumns) -> Floats | None:
 
 def frame_of(columns: TopicColumns) -> str:
     """Frame in the headers of a topic; empty if there is none."""
-    return first_text(columns, _FRAME)
+    return first_text(columns, _frame_field(columns.type_name))
+
+
+def _frame_field(kind: str) -> str:
+    """Field with the frame of a fix, a velocity or an IMU."""
+    fix = find_type(kind).fix
+    return _FRAME if fix is None else fix.frame
 
 
 def _turn_axes(arrays: PoseArrays) -> PoseArrays:
@@ -618,6 +629,9 @@ def numbers(columns: TopicColumns, name: str) -> Floats:
     column = columns.fields.get(name)
     if column is None:
         return np.full(len(columns), np.nan)
+    if isinstance(column, Ragged) and "[]." in name:
+        # Of several bodies or receivers in one message the first.
+        column = column.at(0)
     if not isinstance(column, np.ndarray) or column.ndim != 1:
         what = f"the field {name!r} is not one number a message"
         raise StageError("field_not_a_number", what, where=columns.topic, hint="Name one element: field[0].")

@@ -75,10 +75,12 @@ def move_body(
     if vehicle.moves_sideways:
         v_x = v_x + effects.value("lateral_skid", "c") * aside * yaw_rate
         v_y = v_y - effects.value("roller_slip", "k") * aside * np.abs(aside)
+        v_y = v_y + effects.value("lateral_pull", "c") * v_x
     v_w = (
         v_w
         + effects.value("speed_track", "k") * np.abs(along) * yaw_rate
         + effects.value("yaw_drift", "c") * turning
+        + effects.value("yaw_pull", "c") * v_x
     )
     shaken = _shake(disturbance, turning, drive.step_s, generator)
     v_x, v_y, v_w = v_x + shaken[0], v_y + shaken[1], v_w + shaken[2]

@@ -57,7 +57,20 @@ else:
     KindWord = Literal[(*list_kinds(), *KIND_WORDS)]
 Clock = Literal["header", "log", "publish"]
 Unit = Literal[
-    "rad/s", "mrad/s", "rpm", "deg/s", "m/s", "km/h", "cm/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"
+    "rad/s",
+    "mrad/s",
+    "rpm",
+    "rev/s",
+    "deg/s",
+    "m/s",
+    "km/h",
+    "cm/s",
+    "mm/s",
+    "rad",
+    "deg",
+    "ticks",
+    "erpm",
+    "duty",
 ]
 
 
@@ -546,6 +559,7 @@ def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:
 _KNOWN: Final[Mapping[str, tuple[float, str]]] = {
     "rad/s": (1.0, "rad/s"),
     "rpm": (2.0 * math.pi / 60.0, "rad/s"),
+    "rev/s": (2.0 * math.pi, "rad/s"),
     "deg/s": (math.pi / 180.0, "rad/s"),
     "m/s": (1.0, "m/s"),
     "mm/s": (1e-3, "m/s"),
@@ -563,7 +577,7 @@ def list_factors(*made: str) -> dict[str, float]:
     Args:
         made: SI units of the result.
     """
-    rest = {"cm/s", "km/h", "mrad/s"}
+    rest = {"cm/s", "km/h", "mrad/s", "rev/s"}
     return {unit: factor for unit, (factor, si) in _KNOWN.items() if si in made and unit not in {si, *rest}}
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.core import (
     enumerate_texts,
+    format_count,
     format_duration,
     format_errors,
     format_length,
@@ -92,6 +93,64 @@ def _type_left_out(of: Values) -> str:
     if of["count"]:
         text += f", {of['first_s']:.0f} to {of['last_s']:.0f} s after the start of the log,"
     return f"{text} are left out: they do not have what is read of {', '.join(of['others'])}"
+
+
+def _coarse_stamps(of: Values) -> str:
+    ticks = "whole seconds" if of["value"] == 1.0 else f"steps of {of['value']:g} s"
+    return (
+        f"the stamps of {of['where']} count {ticks}, and its messages come every {of['period_s']:.2g} s: "
+        "they are no times of its messages, and log times were used"
+    )
+
+
+def _several_robots(of: Values, *, why: str) -> str:
+    return (
+        f"{of['where']} holds the transforms of several robots ({name_first(of['frames'])}): {of['child']} "
+        f"is taken, {why.format(**of)}"
+    )
+
+
+def _counter_jumps(of: Values) -> str:
+    return (
+        f"the counters of {', '.join(of['names'])} in {of['where']} jump {format_count(of['count'], 'time')} "
+        f"(by {of['value']:.5g}), as one does that runs over or is set to zero: that is no motion, and was "
+        "left out"
+    )
+
+
+def _velocity_zero(of: Values) -> str:
+    return (
+        f"the velocity of {', '.join(of['names'])} in {of['where']} is zero while the position turns: it is "
+        "not measured, and the positions were differentiated"
+    )
+
+
+def _list_ratios(of: Values) -> str:
+    return ", ".join(f"{one['ratio']:.3g} times for {one['name']}" for one in of["ratios"])
+
+
+def _positions_too_fast(of: Values) -> str:
+    return (
+        f"the velocities of {of['where']} are not what its positions turn ({_list_ratios(of)}), which no "
+        f"wheel does ({of['value']:.3g} rad/s): the velocities are used, and the positions may be counts of "
+        "an encoder"
+    )
+
+
+def _positions_contradicted(of: Values) -> str:
+    why = "its sign" if of["is_opposite"] else "a gear, a unit"
+    return (
+        f"the velocities of {of['where']} contradict its positions: they are {_list_ratios(of)} what these "
+        f"turn ({why} or a scale of the driver): the positions were differentiated"
+    )
+
+
+def _unusual_value(of: Values) -> str:
+    unit = suffix_unit(of["unit"])
+    return (
+        f"{of['parameter']} = {of['value']:.3g}{unit} of {of['where']} is unusual (usual: {of['low']:g} to "
+        f"{of['high']:g}{unit}), and the data prove it: a wrong unit, scale or length has the same effect"
+    )
 
 
 def _interval_applied(of: Values) -> str:
@@ -334,6 +393,24 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "velocity_from_position": "{where} has no velocity of {joints:list}: positions were differentiated",
     "held_wheels": "the encoders are read every {value:.2g} s and each reading is repeated until the next "
     "one: interpolated between readings",
+    "coarse_stamps": _coarse_stamps,
+    "several_robots": {
+        "of the command": partial(_several_robots, why="in the namespace of {drive}"),
+        "undecided": partial(
+            _several_robots,
+            why="and no namespace of {drive} says which is driven; [pose] frames = [parent, child] names "
+            "another",
+        ),
+    },
+    "counter_jumps": _counter_jumps,
+    "velocity_zero": _velocity_zero,
+    "position_unit": "the positions of {where} are what its velocities turn, in {unit}: the velocities are "
+    "used",
+    "velocity_not_of_position": {
+        "positions too fast": _positions_too_fast,
+        "contradicted": _positions_contradicted,
+    },
+    "unusual_value": _unusual_value,
     "unit_wrong": {
         "of positions": "the velocities of {where} are what its positions turn, in {unit}: they were "
         "converted "

@@ -86,6 +86,8 @@ STEADY: list[tuple[Vehicle, Asked, tuple[float, float, float]]] = [
         (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA - 0.1 * V0 * W0, W0),
     ),
     (HUSKY, {"drive_lag": 0.4, "turn_lag": {"tau_mean": 0.2, "tau_diff": 0.9}}, (V0, 0, W0)),
+    (YOUBOT, {"yaw_pull": 0.1}, (AHEAD, ASIDE, AROUND + 0.1 * AHEAD)),
+    (YOUBOT, {"lateral_pull": 0.1}, (AHEAD, ASIDE + 0.1 * AHEAD, AROUND)),
     (YOUBOT, {}, (AHEAD, ASIDE, AROUND)),
     (YOUBOT, {"lateral_scale": 0.8}, (AHEAD, 0.8 * ASIDE, AROUND)),
     (YOUBOT, {"roller_slip": 0.3}, (AHEAD, ASIDE - 0.3 * ASIDE**2, AROUND)),

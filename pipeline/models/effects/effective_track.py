@@ -27,7 +27,7 @@ EffectiveTrack = declare(
     Parameter(
         "k",
         "1",
-        (0.2, 10.0),
+        (0.1, 20.0),
         1.0,
         "effective over nominal track",
         1.8,

@@ -14,7 +14,7 @@ IcrLateral = declare(
     Parameter(
         "y_icr",
         "m",
-        (-1.0, 1.0),
+        (-10.0, 10.0),
         0.0,
         "centre of rotation left of base_link",
         0.08,

@@ -24,7 +24,7 @@ IcrOffset = declare(
     Parameter(
         "x_icr",
         "m",
-        (-2.0, 2.0),
+        (-10.0, 10.0),
         0.0,
         "centre of rotation ahead of base_link",
         0.12,

@@ -15,7 +15,7 @@ SideGain = declare(
     Parameter(
         "e",
         "1",
-        (-0.5, 0.5),
+        (-1.5, 1.5),
         0.0,
         "right minus left gain over their mean",
         0.05,

@@ -14,7 +14,7 @@ WheelAsymmetry = declare(
     Parameter(
         "e",
         "1",
-        (-0.5, 0.5),
+        (-1.5, 1.5),
         0.0,
         "right minus left radius over their mean",
         0.04,

@@ -15,7 +15,7 @@ YawMisalignment = declare(
     Parameter(
         "psi",
         "rad",
-        (-0.8, 0.8),
+        (-1.5, 1.5),
         0.0,
         "reported minus true heading",
         0.05,

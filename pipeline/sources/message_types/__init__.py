@@ -10,7 +10,8 @@ of
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a position on Earth, a velocity east and north;
 - ``text``: a field with a JSON object, whose numbers are called ``field.key``;
-- ``stamp``: time of the measurement, for types without a header.
+- ``stamp``: time of the measurement, for types without a header;
+- ``older``: the same of older layouts of the type, the newest first, which are read as the present one.
 
 ``pairs`` lists topics that belong together by name.
 """
@@ -110,12 +111,13 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A position on Earth [deg], [m]; a status below zero is no fix."""
+    """A position on Earth [deg], [m]; a status below zero is no fix, without a status each is one."""
 
     latitude: str
     longitude: str
     altitude: str
-    status: str
+    status: str = ""
+    frame: str = "header.frame_id"
 
 
 class GroundVelocityFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -167,6 +169,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imu: ImuFields | None = None
     text: TextFields | None = None
     stamp: StampField | None = None
+    older: list["MessageType"] = []
 
 
 class PairedTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -233,6 +236,9 @@ def _spell_fields(kind: MessageType) -> dict[str, str]:
                 given = [f"{given}.{axis}" for axis in _AXES[name]]
             for number, path in enumerate([given] if isinstance(given, str) else given):
                 spelled[f"{part} {said} {number} {name}"] = path
+    if kind.stamp is not None:
+        parts = ("",) if kind.stamp.tick_ns else (".sec", ".nanosec")
+        spelled |= {f"stamp {kind.stamp.tick_ns} 0 {part}": f"{kind.stamp.field}{part}" for part in parts}
     return spelled
 
 
@@ -262,6 +268,31 @@ def find_alike(type_name: str, fields: Iterable[str]) -> dict[str, dict[str, str
         ):
             alike[name] = {path: theirs[meaning] for path, meaning in wanted.items() if meaning in theirs}
     return alike
+
+
+def list_layouts(type_name: str, fields: Iterable[str]) -> tuple[dict[str, str], ...]:
+    """Layouts of a type in which fields of the same meaning and unit are found, the present one first.
+
+    Args:
+        type_name: a message type.
+        fields: paths of some of its fields, as in the present layout.
+
+    Returns:
+        By layout, its path of each of the fields that the type is known to have; none of an unknown type.
+        Names of frames and stamps may be missing in an older one.
+    """
+    own = find_type(type_name)
+    meanings = {path: meaning for meaning, path in _spell_fields(own).items()}
+    wanted = {path: meanings[path] for path in fields if path in meanings}
+    spelled = [_spell_fields(kind) for kind in (own, *own.older)] if wanted else []
+    return tuple(
+        {path: layout[meaning] for path, meaning in wanted.items() if meaning in layout}
+        for layout in spelled
+        if all(
+            meaning in layout or _OPTIONAL.fullmatch(meaning) or meaning.startswith("stamp ")
+            for meaning in wanted.values()
+        )
+    )
 
 
 def list_pairs() -> tuple[Pair, ...]:
