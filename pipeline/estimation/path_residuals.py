@@ -400,9 +400,9 @@ class WheelResiduals(PathResiduals):
 
     def is_followed(self, residual: Floats) -> bool:
         """See `PathResiduals`: the wheels follow where half of one channel's motion is explained."""
-        left = np.square(residual).sum(axis=0)
+        unexplained = np.square(residual).sum(axis=0)
         seen = np.square(np.concatenate(self._seen) * self.spans[:, None]).sum(axis=0)
-        return any(left[channel] <= _MOST_LEFT * seen[channel] for channel in self.channels)
+        return any(unexplained[channel] <= _MOST_LEFT * seen[channel] for channel in self.channels)
 
     def find_velocities(self, state: ModelState, run: int) -> Floats:
         """See `PathResiduals`; in terms of the ideal velocity of the wheels.

@@ -113,8 +113,7 @@ def _several_robots(of: Values, *, why: str) -> str:
 def _counter_jumps(of: Values) -> str:
     return (
         f"the counters of {', '.join(of['names'])} in {of['where']} jump {format_count(of['count'], 'time')} "
-        f"(by {of['value']:.5g}), as one does that runs over or is set to zero: that is no motion, and was "
-        "left out"
+        f"(by {of['value']:.5g}), as one does that runs over or is set to zero: these steps were left out"
     )
 
 

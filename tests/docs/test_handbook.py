@@ -62,7 +62,7 @@ def test_an_effects_page_has_formula_parameters_sentence_source_and_settings() -
     page = write_reference()["effects/effective_track.md"]
 
     assert "\n    w0 = w0 / k" in page
-    assert "| `k` | effective over nominal track | 1 | 0.2 to 10 | 1 | 1.8 |" in page
+    assert "| `k` | effective over nominal track | 1 | 0.1 to 20 | 1 | 1.8 |" in page
     assert "Effective track 0.99 m (nominal 0.55): the robot turns at 56 % of the ideal rate" in page
     assert "Source: Mandow et al." in page
     assert dict(list_settings(find_effect("effective_track")))["ros2_control"] == [

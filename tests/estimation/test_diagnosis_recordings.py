@@ -11,7 +11,6 @@ import pytest
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import (
-    Errors,
     EstimationData,
     Input,
     RunResiduals,
@@ -23,7 +22,7 @@ from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.plausibility import list_implausible
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, Timing, find_effect
-from pipeline.results import RunDiagnosis
+from pipeline.results import Errors, RunDiagnosis
 from pipeline.results.reading import read_model
 from pipeline.words import format_finding
 from pipeline.words.verdict import format_verdict

@@ -44,6 +44,8 @@ NAMESAKES = {
     "sources/recognition.py": {"'wheel_radius'"},
     # An element of Gazebo's DiffDrive and AckermannSteering.
     "export/gazebo.py": {"'wheel_radius'"},
+    # Findings of a clock and of a frame, which are called as the effect that they correct.
+    "words/findings.py": {"'clock_offset'", "'heading_skew'"},
 }
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11))
 

@@ -268,12 +268,12 @@ class WheelServo(JointDrive):
         asked[1, 0] *= -1.0
         numbers = self.list_numbers(vehicle.track_width_m or 1.0, 0.0)
         start = np.zeros(1, dtype=np.int64), np.zeros((2, 3, 1))
-        ahead, around = walk_each([numbers, numbers], [0, 1], asked, *start, _STEP_CELL_S)
-        share = ahead.mean(axis=0) / step
+        straight, spinning = walk_each([numbers, numbers], [0, 1], asked, *start, _STEP_CELL_S)
+        share = straight.mean(axis=0) / step
         if share.max() >= _RISEN:
             seen["rise"] = float(np.argmax(share >= _RISEN) + 1) * _STEP_CELL_S
-        kept = float(around[1, -1] - around[0, -1]) / (2.0 * step)
-        return seen | ({"turned": kept} if kept < _NEARLY_ALL else {})
+        turned = float(spinning[1, -1] - spinning[0, -1]) / (2.0 * step)
+        return seen | ({"turned": turned} if turned < _NEARLY_ALL else {})
 
     def list_numbers(self, track_m: float, imbalance: float) -> Floats:
         """The numbers of `walk_each`."""
