@@ -64,6 +64,8 @@ _SURE = 0.85
 what two bring in .86."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.85 has a standard error of 0.018."""
+_AS_EXPECTED = 0.1
+"""Share of what an effect brings by which the model without it may be worse than its derivatives promise."""
 _OFTEN = 0.1
 """Share of them in which others in its place that cost more than `EQUAL` must cost less, to be as good."""
 _PROMISING = 0.5
@@ -603,8 +605,13 @@ def judge(
         conditions: what the runs can show.
         least_t: standard errors that it must be from none.
     """
-    path, base = fit.path, _drop_linearly(fit, effect.id, matrix.without[effect.id])
-    frequency = _find_frequency(matrix, Change(), Change().drop(effect.id))
+    path, (base, is_linear) = fit.path, _drop_effect(fit, effect.id, matrix.without[effect.id])
+    if is_linear:
+        frequency = _find_frequency(matrix, Change(), Change().drop(effect.id))
+    else:
+        brings = _sum_blocks(base, fit.noise) - _sum_blocks(fit, fit.noise)
+        price = _find_price(fit.state, fit.numbers) - _find_price(base.state, base.numbers)
+        frequency = float(np.mean(_resample(brings.size) @ brings > price))
     costs = [list_costs(path, fit.noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
     own = list_costs(path, fit.noise, base.residual) - list_costs(path, fit.noise, fit.residual)
@@ -644,23 +651,43 @@ def _find_frequency(matrix: Matrix, change: Change, without: Change) -> float:
     return float(np.mean(_resample(brings.size) @ brings > price))
 
 
-def _drop_linearly(fit: PathFit, name: str, residual: Floats) -> PathFit:
-    """A model without one of its effects, which leaves a residual, its other numbers adapted linearly."""
+def _drop_effect(fit: PathFit, name: str, residual: Floats) -> tuple[PathFit, bool]:
+    """A model without one of its effects, its other numbers adapted, and whether linearly.
+
+    Where the adapted model does not do what was expected of it, it is fitted: a delay, for one, promises to
+    do what a lag does, and cannot.
+
+    Args:
+        fit: the model.
+        name: id of the effect.
+        residual: of the model without it, its other numbers as they are, shape (n, 3).
+    """
     path, state = fit.path, fit.state.drop([name])
     places = [index for index, number in enumerate(fit.free) if number.effect != name]
     free, columns = tuple(fit.free[index] for index in places), pick_columns(fit.columns, places)
     smooth = [index for index, number in enumerate(free) if number.is_smooth]
-    if smooth:
-        moving = pick_columns(columns, smooth)
-        low, high = np.array([state.find_room(free[index]) for index in smooth]).T
-        unmoved, moved = residual, np.zeros(len(smooth))
-        for _ in range(3):
-            # Outliers are others without the effect.
-            white = whiten(path, fit.noise, residual, moving)
-            step = invert(white.columns.T @ white.columns) @ (white.columns.T @ white.residual)
-            moved = np.clip(moved + step, low, high)
-            residual = unmoved - combine_columns(moving, moved)
-    return PathFit(path, state, free, residual, columns, fit.noise)
+    linear = PathFit(path, state, free, residual, columns, fit.noise)
+    if not smooth:
+        return linear, True
+    moving = pick_columns(columns, smooth)
+    low, high = np.array([state.find_room(free[index]) for index in smooth]).T
+    adapted, moved = residual, np.zeros(len(smooth))
+    for _ in range(3):
+        # Outliers are others without the effect.
+        white = whiten(path, fit.noise, adapted, moving)
+        step = invert(white.columns.T @ white.columns) @ (white.columns.T @ white.residual)
+        moved = np.clip(moved + step, low, high)
+        adapted = residual - combine_columns(moving, moved)
+    linear = replace(linear, residual=adapted)
+    there = state.move([free[index] for index in smooth], moved.tolist())
+    costs = [
+        float(list_costs(path, fit.noise, one).sum())
+        for one in (fit.residual, adapted, path.find_residuals(there))
+    ]
+    if costs[2] - costs[1] <= EQUAL + _AS_EXPECTED * max(costs[1] - costs[0], 0.0):
+        return linear, True
+    starts = (begin_fit(path, one, fit.noise) for one in (state, there))
+    return fit_roughly(min(starts, key=lambda one: one.score), _STEPS), False
 
 
 def _find_expected_fall(fit: PathFit, change: Floats) -> float:

@@ -122,6 +122,18 @@ def test_a_lag_that_sampling_makes_is_the_delay_of_the_encoders() -> None:
     assert "acceleration_limit" not in found.final.ids
 
 
+@pytest.mark.parametrize("seed", few(range(1, 7), 2))
+def test_a_lag_stays_beside_a_delay_that_promises_to_do_the_same(seed: int) -> None:
+    """Poses came 10 ms late: by its derivative a dead time was as good as the lag, which went."""
+    hidden = {"effective_track": 1.3, "drive_lag": 0.25, "clock_offset": {"d": 0.01}}
+    run = drive(
+        hidden, seed=seed, duration_s=90.0, disturbance=Disturbance(0.01, 0.01), encoders=None, imu=None
+    )
+    data = prepare_data([run], HUSKY, Input.COMMAND)
+    search = Search(data.paths[0], data.list_candidates(Input.COMMAND), data.conditions)
+    assert {"drive_lag", "effective_track"} == set(search.run(data.start_state()).new)
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_of_wheels_that_do_something_else_than_they_are_told_nothing_is_named(seed: int) -> None:
     """By chance a gain or a limit made of another command what comes nearest."""
