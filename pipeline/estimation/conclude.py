@@ -35,6 +35,7 @@ from pipeline.estimation.ladder import ModelAssessment, assess_model, list_order
 from pipeline.estimation.plausibility import measure_moves, note_unusual
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
+from pipeline.recording import Finding
 from pipeline.results import (
     Delays,
     Detectable,
@@ -156,6 +157,7 @@ def summarize(
         findings=(
             *note_cut(body.search.budget),
             *note_unusual(named),
+            *_note_not_followed(results),
             *(() if assessment is None else find_change(assessment)),
         ),
         ladder=() if assessment is None else assessment.ladder.as_result(assessment.floor),
@@ -222,6 +224,14 @@ def of_run(
         when=tuple(one for one in common.when if one.run == number),
         commanded_turn=None if turn is None else turn.as_result(),
     )
+
+
+def _note_not_followed(results: Sequence[PathResult]) -> list[Finding]:
+    """A finding where the wheels do something else than they are told."""
+    finals = [one.outcome.final for one in results]
+    if all(fit.path.is_followed(fit.residual) for fit in finals):
+        return []
+    return [Finding("drive_not_followed", "warning", "wheels")]
 
 
 def _gather(results: Sequence[PathResult], clocks: Clocks, data: EstimationData) -> list[Effect]:

@@ -57,7 +57,7 @@ def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
 def read_finding_table(table: pl.DataFrame) -> tuple[Finding, ...]:
     """The findings of a run's table."""
     rows = table.iter_rows(named=True)
-    return tuple(_read_finding({**row, "values": parse_values(row["values"])}) for row in rows)
+    return tuple(_read_finding({**row, "values": parse_values(row.get("values"))}) for row in rows)
 
 
 def parse_values(text: object) -> JSON:

@@ -410,6 +410,9 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
         "contradicted": _positions_contradicted,
     },
     "unusual_value": _unusual_value,
+    "drive_not_followed": "the measured wheels do not do what the commands ask: no model of the drivetrain "
+    "explains half of their motion, and none of its effects is named ([command] topic in run.toml names the "
+    "command of this drive)",
     "unit_wrong": {
         "of positions": "the velocities of {where} are what its positions turn, in {unit}: they were "
         "converted "
