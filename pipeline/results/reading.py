@@ -55,9 +55,10 @@ def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
 
 
 def read_finding_table(table: pl.DataFrame) -> tuple[Finding, ...]:
-    """The findings of a run's table."""
-    rows = table.iter_rows(named=True)
-    return tuple(_read_finding({**row, "values": parse_values(row.get("values"))}) for row in rows)
+    """The findings of a run's table; of one that has sentences alone, by these."""
+    rows = list(table.iter_rows(named=True))
+    said = [parse_values(row["values"]) if "values" in row else {"error": row["text"]} for row in rows]
+    return tuple(_read_finding({**row, "values": values}) for row, values in zip(rows, said, strict=True))
 
 
 def parse_values(text: object) -> JSON:
