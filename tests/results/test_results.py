@@ -130,3 +130,8 @@ def test_findings_of_untrusted_results_are_texts() -> None:
     assert set(map(format_finding, read_finding_table(table))) == {
         format_finding(Finding("stuck", "warning"))
     }
+
+
+def test_findings_of_tables_with_sentences_alone_are_said_by_them() -> None:
+    row = {"id": "pose_gap", "severity": "info", "where": "", "text": "1 gap in the poses"}
+    assert list(map(format_finding, read_finding_table(pl.DataFrame([row])))) == ["1 gap in the poses"]
