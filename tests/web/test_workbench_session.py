@@ -15,6 +15,7 @@ from workbench_server import RUN, TRACK, Workbench, wait_for
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
+from pipeline.api import Model, load
 from pipeline.estimation import Input
 from pipeline.estimation.prediction import predict_at
 from pipeline.models import read_model
@@ -230,17 +231,40 @@ def test_map_and_commands_show_what_the_model_leaves_of_the_slip(workbench: Work
     assert "signature" not in titles
 
 
-def test_the_evidence_ranks_the_hidden_effect_first_and_offers_nothing_once_it_is_in(
-    workbench: Workbench,
-) -> None:
-    def wait_for_trial() -> list[Json]:
-        workbench.session(RUN, "try")
-        wait_for(lambda: cast("Json", workbench.session(RUN)["trial"])["done"])
-        return cast("list[Json]", cast("Json", workbench.session(RUN)["trial"])["found"])
+def offer(bench: Workbench) -> list[Json]:
+    """The rows of what could be added: of the diagnosis, and of the others that were tried."""
+    bench.session(RUN, "try")
+    wait_for(lambda: cast("Json", bench.session(RUN)["trial"])["done"])
+    shown = bench.session(RUN)
+    return [*cast("list[Json]", shown["named"]), *cast("Json", shown["trial"])["found"]]
 
-    assert wait_for_trial()[0]["id"] == "effective_track"
+
+def test_what_comes_next_is_one_answer_on_the_page_in_python_and_for_the_verb(
+    workbench: Workbench, tmp_path: Path
+) -> None:
+    file, source = tmp_path / "husky.toml", change(workbench)["input"]
+    on = ["--on", RUN, "--results", str(workbench.results), "--input", source]
+    assert run_verb("model", "new", str(file), "--vehicle", "husky_a200", "--quiet").returncode == 0
+    run, model = load(RUN, results=workbench.results), Model("husky_a200")
+    rows = offer(workbench)
+    assert rows[0]["id"] == "effective_track"
+    missing = model.missing(run, input=source)
+    assert {one for row in rows for one in (row["id"], *row["twins"])} == {
+        one for row in missing.rows(named=True) for one in (row["effect"], *row["same_as"])
+    }
+    first = missing.row(0, named=True)
+    assert (first["effect"], first["t_mrmse_m"], first["r_mrmse_rad"]) == (
+        "effective_track",
+        pytest.approx(rows[0]["to"]["t"], rel=1e-4),
+        pytest.approx(rows[0]["to"]["r"], rel=1e-4),
+    )
+    for row in rows:
+        assert run_verb("model", "add", str(file), row["id"], *on, "--json").returncode == 0
+        assert run_verb("model", "drop", str(file), row["id"], *on, "--quiet").returncode == 0
+    # After the last one that is accepted, nothing is next.
     change(workbench, "add", effect="effective_track")
-    assert wait_for_trial() == []
+    assert offer(workbench) == []
+    assert (model + "effective_track").fit(run, input=source).model.missing(run, input=source).is_empty()
 
 
 @pytest.mark.parametrize("effect", ["wheel_radius", "side_lag", "lateral_skid"])
