@@ -280,6 +280,8 @@ def test_verb_page_and_card_give_one_reason_against_an_effect(
     assert (said["code"], asked.returncode) == ("no_help", 1)
     reason = said["message"].partition("(")[2].partition("): the model is unchanged")[0]
     assert f"{effect} is not supported by the data ({reason}): the model is unchanged" in asked.stderr
+    # The errors with it are shown all the same.
+    assert f"\n+ {effect}" in asked.stdout
     added = change(workbench, "add", effect=effect, anyway=True)
     assert {one["id"]: one["refused"] for one in added["effects"]} == {effect: reason}
     assert json.loads(run_verb(*add, "--anyway", "--json").stdout)["refused"] == {effect: reason}
