@@ -55,6 +55,7 @@ from pipeline.core.text import (
     format_two,
     group_by,
     guess_names,
+    list_nearest,
     make_plain,
     mark_finding,
     name_first,

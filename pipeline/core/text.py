@@ -1,6 +1,7 @@
 """Texts: errors, numbers with their digits, lengths, durations, shares in words; levels of statistics."""
 
 import math
+import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -81,6 +82,18 @@ def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:
 
     near = difflib.get_close_matches(name.removesuffix(end), [one.removesuffix(end) for one in known], n=3)
     return f"Did you mean {' or '.join(f'{one}{end}' for one in near)}? " if near else ""
+
+
+def list_nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
+    """The known names that resemble a name most, as a whole or in their beginning, the nearest first."""
+    import difflib  # noqa: PLC0415 - only needed once something is already wrong
+
+    def rate(one: str) -> tuple[float, int]:
+        parts = (one, one[: len(name)])
+        alike = max(difflib.SequenceMatcher(None, name, part).ratio() for part in parts)
+        return alike, len(os.path.commonprefix([name, one]))
+
+    return sorted(known, key=rate, reverse=True)[:count]
 
 
 def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
