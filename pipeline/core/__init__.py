@@ -17,7 +17,9 @@ from pipeline.core.memory import limit_memory, measure_memory, read_memory
 from pipeline.core.processes import (
     PACKAGE,
     end_with,
+    find_cache_folder,
     keep_current_folder_out,
+    name_install,
     prepare_workers,
     python_command,
     read_version,

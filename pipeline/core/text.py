@@ -1,7 +1,6 @@
 """Texts: errors, numbers with their digits, lengths, durations, shares in words; levels of statistics."""
 
 import math
-import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -10,6 +9,8 @@ from typing import Any, Literal, TypeVar, get_args
 Key = TypeVar("Key")
 Item = TypeVar("Item")
 
+_BEGINNING = 3
+"""Letters of the beginning that decide between names which are equally near."""
 _READABLE = 300
 """Maximum number of characters of quoted text in a sentence: four lines of a screen."""
 LONGEST_NAME = 200
@@ -88,10 +89,10 @@ def list_nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
     """The known names that resemble a name most, as a whole or in their beginning, the nearest first."""
     import difflib  # noqa: PLC0415 - only needed once something is already wrong
 
-    def rate(one: str) -> tuple[float, int]:
+    def rate(one: str) -> tuple[float, bool]:
         parts = (one, one[: len(name)])
         alike = max(difflib.SequenceMatcher(None, name, part).ratio() for part in parts)
-        return alike, len(os.path.commonprefix([name, one]))
+        return alike, one.startswith(name[:_BEGINNING])
 
     return sorted(known, key=rate, reverse=True)[:count]
 
