@@ -20,7 +20,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-comp
 ONE_CORE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10
 
 .DEFAULT_GOAL := help
-.PHONY: analyze batch bench browser check clean compare docs help hidden-effect samples serve test test-long
+.PHONY: analyze batch bench browser check clean compare docs help hidden-effect release samples serve test test-long
 
 help: ## print this list; `slip --help` lists what the program does
 	@awk -F ':.*## ' 'BEGIN { print "For users\n" } /^##@ / { print "\n" substr($$0, 5) "\n" } /^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' \
@@ -80,6 +80,11 @@ samples: $(VENV)/.ready-dev ## make the simulated logs in data_samples again, an
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --file data_samples/$$case.mcap || exit 1; done
 	$(BIN)/python benchmarks game/mystery write data_samples
+
+release: $(VENV)/.ready-dev ## the version of pyproject.toml: checks, tests, wheel, notes and tag, nothing is sent
+	@$(BIN)/python packaging/release.py --check
+	@$(MAKE) --no-print-directory check test
+	@$(BIN)/python packaging/release.py
 
 browser: ## install Debian's Chromium, for the tests that look at pages
 	apt-get update && apt-get install --yes --no-install-recommends chromium

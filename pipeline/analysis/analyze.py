@@ -101,7 +101,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     if options.diagnosis:
         require_compiler(otherwise="leave it out with --no-diagnosis")
     if options.report or options.figures:
-        require_package("vl_convert", "report", "a report", otherwise="leave it out with --no-report")
+        require_package("vl_convert", "", "a report", otherwise="leave it out with --no-report")
     store = Store(options.out)
     setup = set_up_log(path, options)
     # The setup restores addresses that the command line altered.

@@ -158,6 +158,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         "run": work.run,
         "key": generation.key,
         "log": dict(log),
+        "simulated": setup.index.is_simulated,
         "vehicle": setup.vehicle.id,
         "vehicle_name": setup.vehicle.name,
         "terrain": setup.terrain,

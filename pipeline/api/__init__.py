@@ -47,6 +47,7 @@ else:
                 "Fit",
                 "Model",
                 "effect",
+                "effects",
                 "list_parameters",
                 "load_effects",
             ),

@@ -28,7 +28,10 @@ from pipeline.models import (
     ModelFile,
     catalogue,
     find_effect,
+    list_effects,
+    list_own_effects,
     make_parameter,
+    name_term,
     read_model,
     refuse_taken,
     write_model,
@@ -128,6 +131,28 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
             raise MotionError("bad_value", what, where=f"effect {name}", hint=f'Write {key}=("m/s", -1, 1).')
     parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
     return FormulaEffect(name, texts, tuple(parameters))
+
+
+def effects() -> pl.DataFrame:
+    """The physical effects that a model may have: the catalogue, and those of your own that were loaded.
+
+    Returns:
+        A row an effect: ``effect``, its id; ``term``, its name; ``sentence``, what happens; ``parameters``
+        and ``units``, lists of the same length; ``kinds``, the vehicles that can have it.
+    """
+    return pl.DataFrame(
+        [
+            {
+                "effect": one.id,
+                "term": name_term(one.id),
+                "sentence": one.find_page().partition("\n")[0].rpartition(": ")[2],
+                "parameters": [each.name for each in one.parameters],
+                "units": [each.unit for each in one.parameters],
+                "kinds": list(one.kinds),
+            }
+            for one in (*list_effects(), *list_own_effects().values())
+        ]
+    )
 
 
 def load_effects(*paths: str | Path) -> None:

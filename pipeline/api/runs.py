@@ -24,7 +24,15 @@ from pipeline.api.fitted_model import (
 from pipeline.api.model_changes import contest_models
 from pipeline.api.opening import Opener, open_quietly, read_run
 from pipeline.batch.recordings import list_named
-from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
+from pipeline.core import (
+    INPUTS,
+    SlipError,
+    format_recorded,
+    mapping_in,
+    number_in,
+    objects_in,
+    require_package,
+)
 from pipeline.datasets import (
     RunsCheck,
     check_runs,
@@ -38,12 +46,14 @@ from pipeline.report.scene import RunReport
 from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result, read_suggestion
 from pipeline.results import read_model as read_diagnosed_model
 from pipeline.sources import Owner, load_vehicle
-from pipeline.store import REPORT, Manifest, Store, find_run, read_choices
+from pipeline.store import REPORT, Manifest, Store, find_run, read_choices, to_arrow
 from pipeline.words import check_as_json, diagnosis_as_json, format_junit, format_markdown, list_check_lines
 from pipeline.words import diagnosis as words
 from schemas import contract_of
 
 if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
     import xarray
 
     Content = Mapping[str, object]
@@ -171,6 +181,26 @@ class Run(StoredRun):
             {"input": inputs.to_list(), "t": ("t", times["t"].to_numpy(), contract.metadata_of("t"))},
             {"run": self.name},
         )
+
+    def to_arrow(self, table: str = "slip") -> pa.Table:
+        """A table as a ``pyarrow.Table`` whose fields have ``unit``, ``frame`` and ``description``.
+
+        Args:
+            table: one of `tables`.
+        """
+        return to_arrow(contract_of(table), self.manifest.read(table))
+
+    def to_pandas(self, table: str = "slip") -> pd.DataFrame:
+        """A table as a frame of pandas.
+
+        Args:
+            table: one of `tables`.
+
+        Raises:
+            SlipError: ``no_pandas``, the extra ``pandas`` is not installed.
+        """
+        require_package("pandas", "pandas", "a frame of pandas", otherwise="use `to_arrow`")
+        return self.manifest.read(table).to_pandas()
 
     def plot(self, figure: str = "trajectory", *, model: Model | None = None) -> ShownFigure:
         """One figure of its report, which a notebook shows.

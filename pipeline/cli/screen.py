@@ -168,8 +168,10 @@ def _format_head(summary: Summary) -> list[str]:
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
     named = [(key, str(summary[key])) for key in ("vehicle", "terrain")]
+    names = [f"{key} unknown" if name == "unknown" else name for key, name in named]
     facts = [
-        *(f"{key} unknown" if name == "unknown" else name for key, name in named),
+        # Simulated terrain may have no other name.
+        *dict.fromkeys(["simulated", *names] if summary.get("simulated") else names),
         format_recorded(seconds, summary.get("duration_s")),
     ]
     if isinstance(distance, (int, float)):

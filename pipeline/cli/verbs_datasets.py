@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from pipeline import api, words
 from pipeline.cli.conventions import All, Results, open_results, print_result
-from pipeline.core import PACKAGE, FigureFormat
+from pipeline.core import FigureFormat, name_install
 
 
 def compare(  # noqa: D417 - arguments document themselves
@@ -76,7 +76,7 @@ def compare(  # noqa: D417 - arguments document themselves
     return print_result(answer, lambda: lines, json=json, quiet=quiet)
 
 
-_NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"
+_NO_PAGE = f"none: {name_install()} draws it"
 
 
 def draw(  # noqa: D417 - arguments document themselves

@@ -113,12 +113,14 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         said = spell_choices(choices) + spell_flags(flags)
         said += "".join(spell_flags({"effects": path}) for path in effects or ())
         for answer in answers:
+            simulated = [run.run for run in answer if chosen[run.run].get("simulated")]
             names = [run.run for run in answer]
             # A folder is shorter than what it holds.
             names = logs if len(logs) < len(names) and len(answers) == 1 else names
             applying = f"slip diagnose {' '.join(map(shlex.quote, names))}{said} --apply model.toml"
             following = _suggest_next(answer, applying, apply)
-            print_lines(words.describe(answer, following, everything=everything).splitlines())
+            text = words.describe(answer, following, simulated=simulated, everything=everything)
+            print_lines(text.splitlines())
     if lossy and not quiet:
         print_note(f"logs with losses: {', '.join(lossy)} (slip inspect {lossy[0]} lists them)")
     return exit_code(

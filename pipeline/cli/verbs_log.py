@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -41,6 +42,7 @@ from pipeline.core import (
     format_share,
     format_size,
     name_first,
+    name_install,
     shorten,
 )
 
@@ -87,6 +89,13 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     """
     if effects:
         models.load_effects(effects)
+    effects_wanted, report_wanted = diagnosis, report
+    diagnosis &= find_spec("numba") is not None
+    report &= find_spec("vl_convert") is not None
+    left_out = ["the effects (Numba)"] * (effects_wanted and not diagnosis)
+    left_out += ["the report (vl-convert)"] * (report_wanted and not report)
+    if left_out:
+        print_note(f"slip: left out, not installed: {' and '.join(left_out)}; to have it: {name_install()}")
     options = replace(build_options(choices), report=report, diagnosis=diagnosis, figures=figures)
     options = replace(options, force=force, model=model)
     outcomes: list[Outcome] = []

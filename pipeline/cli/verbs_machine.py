@@ -30,7 +30,7 @@ from pipeline.cli.conventions import (
     print_note,
     print_result,
 )
-from pipeline.core import PACKAGE, measure_memory, read_version, require_package
+from pipeline.core import PACKAGE, measure_memory, name_install, read_version, require_package
 
 
 def serve(  # noqa: D417 - the results folder documents itself
@@ -220,9 +220,7 @@ def _look_at_extras() -> MachineCheck:
     if not lacking:
         return MachineCheck("extras", "ok", "all are installed")
     what = f"not installed: {', '.join(f'{extra} ({name})' for extra, name in sorted(lacking.items()))}"
-    return MachineCheck(
-        "extras", "optional", what, f"For one of them: pip install '{PACKAGE}[{min(lacking)}]'"
-    )
+    return MachineCheck("extras", "optional", what, f"For one of them: {name_install(min(lacking))}")
 
 
 def _read_numbers(version: str) -> list[int]:
@@ -243,7 +241,7 @@ def _look_at_loops() -> MachineCheck:
     count = compile_every_loop()
     caches = core.list_caches()
     if find_spec("numba") is None:
-        hint = f"For diagnoses: pip install '{PACKAGE}[diagnose]'"
+        hint = f"For diagnoses: {name_install()}"
         return MachineCheck(name, "optional", "Numba is not installed; slip tables do without it", hint)
     if not caches:
         what = f"{count} loops run as Python, 100 times slower"

@@ -17,7 +17,9 @@ from pipeline.core.memory import limit_memory, measure_memory, read_memory
 from pipeline.core.processes import (
     PACKAGE,
     end_with,
+    find_cache_folder,
     keep_current_folder_out,
+    name_install,
     prepare_workers,
     python_command,
     read_version,
@@ -55,6 +57,7 @@ from pipeline.core.text import (
     format_two,
     group_by,
     guess_names,
+    list_nearest,
     make_plain,
     mark_finding,
     name_first,

@@ -1,7 +1,8 @@
 """Loops over signals, written as plain Python and compiled by Numba when they are called for the first time.
 
-The machine code is cached beside the source, or in the user's cache directory, or in ``NUMBA_CACHE_DIR``;
-`slip doctor` says where. ``NUMBA_DISABLE_JIT=1`` runs the Python source instead, with the same results, as it
+The machine code is cached in ``NUMBA_CACHE_DIR``, else beside the source of a checkout, or in the folder of
+`find_cache_folder` for an installation, whose own folders pip must find as it made them; `slip doctor` says
+where. ``NUMBA_DISABLE_JIT=1`` runs the Python source instead, with the same results, as it
 is where Numba is not installed: fits are refused then (`require_compiler`). A loop allocates nothing: it
 writes into its array arguments.
 """
@@ -10,13 +11,15 @@ from __future__ import annotations
 
 import functools
 import importlib
+import sysconfig
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pipeline.core.processes import require_package
+from pipeline.core.processes import find_cache_folder, require_package
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,7 +52,10 @@ class _Loop:
         for name in function.__code__.co_names:
             if isinstance(loop := names.get(name), _Loop):
                 names[name] = loop.made
-        compile_it = functools.partial(importlib.import_module("numba").njit, *filter(None, [self.signature]))
+        numba = importlib.import_module("numba")
+        if not numba.config.CACHE_DIR and Path(__file__).is_relative_to(sysconfig.get_path("purelib")):
+            numba.config.CACHE_DIR = str(find_cache_folder() / "loops")
+        compile_it = functools.partial(numba.njit, *filter(None, [self.signature]))
         try:
             return compile_it(cache=True, **_HOW)(function)
         except RuntimeError:  # no directory of the cache can be written to
@@ -82,7 +88,7 @@ def require_compiler(*, otherwise: str = "") -> None:
     Raises:
         SlipError: ``no_numba``.
     """
-    require_package("numba", "diagnose", "a fit of effects", otherwise=otherwise)
+    require_package("numba", "", "a fit of effects", otherwise=otherwise)
 
 
 def list_caches() -> set[str | None]:

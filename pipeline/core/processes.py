@@ -42,12 +42,23 @@ def read_version() -> str:
         return str(content["project"]["version"])
 
 
+def name_install(extra: str = "") -> str:
+    """The command that installs what an extra needs, or what comes without one."""
+    return f"pip install '{PACKAGE}[{extra}]'" if extra else f"pip install {PACKAGE}"
+
+
+def find_cache_folder() -> Path:
+    """Folder of what is kept for the next call: compiled loops of an installation, scripts of pages."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "slip"
+
+
 def require_package(name: str, extra: str, purpose: str, *, otherwise: str = "") -> None:
     """Refuse what needs a package of an extra that is not installed.
 
     Args:
         name: the package, as it is imported.
-        extra: the extra of `slip-pipeline` that installs it.
+        extra: the extra of `slip-pipeline` that installs it; empty for what comes without one.
         purpose: what needs it, the beginning of a sentence.
         otherwise: how to do without it.
 
@@ -56,7 +67,7 @@ def require_package(name: str, extra: str, purpose: str, *, otherwise: str = "")
     """
     if find_spec(name) is None:
         what = f"{purpose} needs {name}, which is not installed"
-        hint = f"Install the extra: pip install '{PACKAGE}[{extra}]'"
+        hint = f"Install it: {name_install(extra)}"
         raise SlipError(f"no_{name}", what, hint=f"{hint}, or {otherwise}" if otherwise else hint)
 
 

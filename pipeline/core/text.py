@@ -9,6 +9,8 @@ from typing import Any, Literal, TypeVar, get_args
 Key = TypeVar("Key")
 Item = TypeVar("Item")
 
+_BEGINNING = 3
+"""Letters of the beginning that decide between names which are equally near."""
 _READABLE = 300
 """Maximum number of characters of quoted text in a sentence: four lines of a screen."""
 LONGEST_NAME = 200
@@ -81,6 +83,18 @@ def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:
 
     near = difflib.get_close_matches(name.removesuffix(end), [one.removesuffix(end) for one in known], n=3)
     return f"Did you mean {' or '.join(f'{one}{end}' for one in near)}? " if near else ""
+
+
+def list_nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
+    """The known names that resemble a name most, as a whole or in their beginning, the nearest first."""
+    import difflib  # noqa: PLC0415 - only needed once something is already wrong
+
+    def rate(one: str) -> tuple[float, bool]:
+        parts = (one, one[: len(name)])
+        alike = max(difflib.SequenceMatcher(None, name, part).ratio() for part in parts)
+        return alike, one.startswith(name[:_BEGINNING])
+
+    return sorted(known, key=rate, reverse=True)[:count]
 
 
 def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:

@@ -19,7 +19,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
-from pipeline.core import MOST_BYTES, TooLargeError
+from pipeline.core import MOST_BYTES, TooLargeError, name_install
 from pipeline.logs.records import LogError
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def open_store(url: str) -> AbstractFileSystem:
             "no_object_store",
             f"the packages that read an object store are not installed ({error})",
             where=url,
-            hint="pip install 'slip-pipeline[s3]'",
+            hint=name_install("s3"),
         ) from None
     if limits:
         store.retries = _ROUNDS

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Final, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Ints, group_by, name_first
+from pipeline.core import PACKAGE, Ints, group_by, name_first
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.decode import Leaf, plan_fields, wanted_leaves
 from pipeline.logs.records import LogError, unsupported
@@ -260,7 +260,7 @@ class _RowWriter:
         return filled
 
 
-LIBRARY: Final = "slip-pipeline"
+LIBRARY: Final = PACKAGE
 COMPRESSIONS: Final = {"": "NONE", "lz4": "LZ4", "zstd": "ZSTD"}
 _SECOND: Final = 1_000_000_000
 

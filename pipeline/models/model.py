@@ -11,7 +11,7 @@ from typing import Self, TypeVar, cast
 
 import numpy as np
 
-from pipeline.core import Floats
+from pipeline.core import Floats, guess_names
 from pipeline.models.effect import (
     AddedEffect,
     BodyEffect,
@@ -107,8 +107,9 @@ class Model:
         for effect in self.effects:
             if effect.id == name:
                 return effect
-        hint = f"It has: {', '.join(self.ids) or 'none'}."
-        raise MotionError("no_such_effect", f"the model has no effect {name!r}", where=name, hint=hint)
+        hint = f"{guess_names(name, self.ids)}The model has: {', '.join(self.ids) or 'none'}."
+        what = f"no effect of the model is called {name!r}"
+        raise MotionError("no_such_effect", what, where=name, hint=hint)
 
     def change(self, name: str, **values: float) -> Model:
         """The model with other parameter values of one effect.

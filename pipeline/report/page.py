@@ -176,7 +176,7 @@ def _render(name: str, spec: dict[str, object], format: str) -> bytes:  # noqa: 
     if format not in FORMATS:
         hint = f"Use one of {', '.join(FORMATS)}"
         raise ReportError("figure_format_unknown", f"no figure can be written as {format!r}", hint=hint)
-    require_package("vl_convert", "report", "a figure")
+    require_package("vl_convert", "", "a figure")
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
     if format == "svg":

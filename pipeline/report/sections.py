@@ -265,6 +265,8 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     losses = objects_in(log, "losses")
     complete = log.get("complete") is not False and not losses
     strip = [("good", "log complete") if complete else ("error", f"log has losses ({max(len(losses), 1)})")]
+    if report.summary.get("simulated"):
+        strip.append(("note", "simulated"))
     if log.get("unchecked"):
         strip.append(("note", "log unchecked"))
     segments = report.number("segments")

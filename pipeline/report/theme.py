@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.core import python_command, require_package
+from pipeline.core import find_cache_folder, python_command, require_package
 from pipeline.store import replace_file
 
 SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
@@ -332,7 +332,7 @@ _EXPOSE = "window.vegaEmbed = vegaEmbed;"
 
 def load_bundle() -> str:
     """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
-    require_package("vl_convert", "report", "a page with figures")
+    require_package("vl_convert", "", "a page with figures")
     path = cache_path()
     with contextlib.suppress(OSError):
         digest, _, body = path.read_bytes().partition(b"\n")
@@ -383,9 +383,8 @@ def _bundle_apart() -> None:
 
 def cache_path() -> Path:
     """Cache path of the bundle of the installed version."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
-    return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
+    return find_cache_folder() / f"vega-{version('vl-convert-python')}-{what}.js"
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def unknown_name(kind: str, name: str, known: list[str]) -> SimulateError:
     if kind in {"case", "effect"}:
         every = f"`slip simulate --cases` lists every {kind}."
     hint = f"{guess_names(name, known)}{every}"
-    return SimulateError(f"unknown_{kind}", f"there is no {kind} '{name}'", hint=hint)
+    return SimulateError(f"unknown_{kind}", f"no {kind} is called {name!r}", where=name, hint=hint)
 
 
 def read_facts(name: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
-from pipeline.core import SlipError, guess_names, suffix_unit
+from pipeline.core import SlipError, list_nearest, suffix_unit
 from pipeline.sources.kinematics import Kinematics, find_kinematics, list_kinds
 
 
@@ -543,17 +543,24 @@ def check_geometry(vehicle: Vehicle, where: str) -> None:
 
 
 def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:
-    known = [vehicle.id for vehicle in list_presets()]
-    names = ", ".join(known)
     if named:
-        guess = guess_names(named, known)
-        hint = f"{guess}Write one of: {names}; or the vehicle's own values in its place."
+        hint = suggest_presets(named)
     else:
+        names = ", ".join(vehicle.id for vehicle in list_presets())
         hint = (
             f"Give --vehicle NAME (make: VEHICLE=NAME) with one of {names}; "
             "or --wheel-radius and --track-width in metres."
         )
     return ConfigurationError("vehicle_unknown", what, where=where, hint=hint)
+
+
+def suggest_presets(name: str) -> str:
+    """Hint for a preset of a name that does not exist: the nearest three."""
+    presets = [vehicle.id for vehicle in list_presets()]
+    return (
+        f"The nearest of {len(presets)} presets are {', '.join(list_nearest(name, presets))}; or give the"
+        " vehicle's own values in its place."
+    )
 
 
 _KNOWN: Final[Mapping[str, tuple[float, str]]] = {

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from pipeline.core import TomlError, guess_names, parse_toml, read_bounded_text, require_finite, shorten
+from pipeline.core import TomlError, parse_toml, read_bounded_text, require_finite, shorten
 from pipeline.logs import stem_of
 from pipeline.sources.configuration import (
     Configuration,
@@ -17,7 +17,7 @@ from pipeline.sources.configuration import (
     explain_range,
     find_preset,
     list_bounds,
-    list_presets,
+    suggest_presets,
 )
 
 _PLACE = re.compile(r"at `\$\.?([^`]*)`")
@@ -104,13 +104,11 @@ def check_preset(tree: Mapping[str, object], source: Path) -> None:
     vehicle = tree.get("vehicle")
     name = vehicle.get("preset") if isinstance(vehicle, dict) else None
     if isinstance(name, str) and find_preset(name) is None:
-        known = sorted(preset.id for preset in list_presets())
         raise ConfigurationError(
             "vehicle_unknown",
             f"no vehicle preset is called {name!r}",
             where=_name_line(str(source), source, ["vehicle", "preset"], name),
-            hint=f"{guess_names(name, known)}Write one of: {', '.join(known)}; or the vehicle's own values in"
-            " its place.",
+            hint=suggest_presets(name),
         )
 
 

@@ -54,6 +54,7 @@ else:
                 "CheckedTable",
                 "check_size",
                 "check_table",
+                "to_arrow",
             ),
             "results_folder": (
                 "Store",

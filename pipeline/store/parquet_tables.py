@@ -264,6 +264,16 @@ def name_broken_rules(failure: FailureInfo) -> pl.DataFrame:
     return rows.with_columns(broken.to_series())
 
 
+def to_arrow(contract: Contract, frame: pl.DataFrame, facts: Mapping[str, float] = NO_FACTS) -> pa.Table:
+    """A frame as an Arrow table.
+
+    Fields carry unit, frame and description, the schema carries ``contract``, ``contract_version`` and the
+    facts.
+    """
+    table = frame.rechunk().to_arrow(compat_level=pl.CompatLevel.oldest())
+    return pa.Table.from_arrays(table.columns, schema=_annotate(contract, table.schema, facts))
+
+
 def encode_parquet(
     contract: Contract,
     frame: pl.DataFrame,
@@ -271,22 +281,17 @@ def encode_parquet(
     *,
     compression: str = "zstd",
 ) -> bytes:
-    """A frame as Parquet bytes; the same frame gives the same bytes.
-
-    Fields carry unit, frame and description, the schema carries ``contract``, ``contract_version`` and the
-    facts.
-    """
-    table = frame.rechunk().to_arrow(compat_level=pl.CompatLevel.oldest())
-    schema = _annotate(contract, table.schema, facts)
+    """A frame as Parquet bytes, described as by `to_arrow`; the same frame gives the same bytes."""
+    table = to_arrow(contract, frame, facts)
     sink = pa.BufferOutputStream()
     pq.write_table(
-        pa.Table.from_arrays(table.columns, schema=schema),
+        table,
         sink,
         compression=compression,
         compression_level=_ZSTD_LEVEL if compression == "zstd" else None,
         row_group_size=_ROWS_PER_GROUP,
         # Numbers of a sensor hardly repeat: their dictionaries would be larger than they are.
-        use_dictionary=[field.name for field in schema if not pa.types.is_floating(field.type)],
+        use_dictionary=[field.name for field in table.schema if not pa.types.is_floating(field.type)],
     )
     data: bytes = sink.getvalue().to_pybytes()
     return data

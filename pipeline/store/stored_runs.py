@@ -169,9 +169,9 @@ DIAGNOSIS = "diagnosis.json"
 
 
 def read_choices(manifest: Manifest) -> dict[str, object]:
-    """Topics and vehicle that were chosen for a stored run: ``choices`` and ``vehicle_source``."""
+    """What a run was read from: ``choices``, ``vehicle_source``, and whether the log is ``simulated``."""
     summary = manifest.read_json(SUMMARY) if SUMMARY in manifest.files else {}
-    return {key: summary[key] for key in ("choices", "vehicle_source") if key in summary}
+    return {key: summary[key] for key in ("choices", "vehicle_source", "simulated") if key in summary}
 
 
 def read_length_scale(manifest: Manifest) -> float:

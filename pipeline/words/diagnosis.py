@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from pipeline.core import (
@@ -104,18 +104,27 @@ _LONGEST_TERM = 70
 """Characters up to which a suggested term is shown: a longer one is no formula that anybody reads."""
 
 
-def describe(runs: Sequence[RunDiagnosis], following: str = "", *, everything: bool = False) -> str:
+def describe(
+    runs: Sequence[RunDiagnosis],
+    following: str = "",
+    *,
+    simulated: Collection[str] = (),
+    everything: bool = False,
+) -> str:
     """A diagnosis as plain text; the common part of runs that were judged together appears once.
 
     Args:
         runs: of one run, or of all that were judged together.
         following: command suggested as the next step, where effects were identified.
+        simulated: names of the runs whose logs are simulated.
         everything: show all sections, not only verdict, main effects and remaining error.
     """
     first, *others = runs
-    heads = [run.run for run in runs]
+    heads = [f"{run.run}{'    simulated' if run.run in simulated else ''}" for run in runs]
     if len(runs) > _HEADS_SHOWN and not everything:
-        heads = [f"{len(runs)} runs, {runs[0].run} to {runs[-1].run}"]
+        count = sum(run.run in simulated for run in runs)
+        said = f"    {'all' if count == len(runs) else count} simulated" if count else ""
+        heads = [f"{len(runs)} runs, {runs[0].run} to {runs[-1].run}{said}"]
     heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason or '')}"
     lines = list_lines(first, others, everything=everything)
     rows = format_lines(lines)

@@ -1,6 +1,7 @@
 """The sample logs: what their README says, and that they are what the simulator makes."""
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from few import few
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from verbs import print_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -33,6 +35,18 @@ def test_the_readme_gives_the_medians(name: str, samples: Path, tmp_path: Path) 
     if measured != "-":
         assert by_input["measured"]["median_modulus"] == pytest.approx(float(measured.split()[0]), rel=0.01)
         assert by_input["measured"]["median_window_norm"] == pytest.approx(float(measured_norm), rel=0.01)
+
+
+def test_a_simulated_log_says_so_by_its_metadata_and_a_recorded_one_does_not(
+    samples: Path, tmp_path: Path
+) -> None:
+    shutil.copy(samples / "husky_tile.mcap", tmp_path / "run.mcap")
+    logs = (tmp_path / "run.mcap", samples / "recorded" / "diff_circular.mcap")
+    told = [
+        print_verb("analyze", log, "--no-report", "--no-diagnosis", "--results", tmp_path / "out", code=0)
+        for log in logs
+    ]
+    assert ["simulated" in text.splitlines()[0] for text in told] == [True, False]
 
 
 @pytest.mark.long

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
+import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 from verbs import ask_verb
@@ -159,6 +160,29 @@ def test_without_xarray_it_says_what_to_install(run: slip.Run, monkeypatch: pyte
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(slip.SlipError, match="xarray is not installed"):
         run.to_xarray()
+
+
+@pytest.mark.parametrize("table", ["slip", "poses"])
+def test_a_table_keeps_its_units_in_arrow(run: slip.Run, table: str) -> None:
+    arrow = run.to_arrow(table)
+    stored = pq.read_schema(run.manifest.path(table))
+    assert [field.metadata for field in arrow.schema] == [field.metadata for field in stored]
+    assert b"unit" in arrow.schema.field("t").metadata
+    assert pl.DataFrame(arrow).equals(run.manifest.read(table))
+
+
+def test_without_pandas_it_names_the_extra(run: slip.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(slip.SlipError, match=r"pip install 'slip-pipeline\[pandas\]'"):
+        run.to_pandas()
+
+
+def test_the_catalogue_is_a_table() -> None:
+    found = slip.effects()
+    assert {"effective_track", "drive_lag"} <= set(found["effect"])
+    one = found.row(by_predicate=pl.col("effect") == "drive_lag", named=True)
+    assert (one["term"], one["parameters"], one["units"]) == ("lag of the drive", ["tau"], ["s"])
+    assert all(found["sentence"].str.len_chars() > 0)
 
 
 def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis) -> None:

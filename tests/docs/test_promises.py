@@ -109,5 +109,5 @@ def test_the_names_of_python_are_there() -> None:
 def test_the_version_is_the_same_everywhere() -> None:
     (version,) = re.findall(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f"## {version}\n" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"## {version} - " in (ROOT / "CHANGELOG.md").read_text()
     assert f"\n{version}\n" in (ROOT / "docs" / "pages" / "install.md").read_text()

@@ -46,7 +46,7 @@ def test_the_container_has_what_its_page_advises() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
         "optional-dependencies"
     ]
-    for extra in ("build", "diagnose", "report", "s3", "serve"):
+    for extra in ("build", "s3", "serve"):
         for wanted in extras[extra]:
             name = re.split(r"[<>=\[]", wanted)[0]
             assert name == "slip-pipeline" or f"\n{name}==" in f"\n{locked}", name

@@ -17,18 +17,19 @@ from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
 ROOT = Path(__file__).parents[2]
-EXTRAS = ("distributed", "llvmlite", "numba", "pandas", "s3fs", "starlette", "uvicorn",
-          "vl_convert")  # fmt: skip
+EXTRAS = ("distributed", "pandas", "s3fs", "starlette", "uvicorn")
+DRAWN_OR_COMPILED = ("llvmlite", "numba", "vl_convert")
+"""Packages that come without an extra, and that a machine may lack nevertheless."""
 LEAN = f"""
 import sys
 
 class Hidden:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {EXTRAS!r}:
+        if name.partition(".")[0] in {(*EXTRAS, *DRAWN_OR_COMPILED)!r}:
             raise ModuleNotFoundError(f"no module named {{name}}", name=name)
 
 sys.meta_path.insert(0, Hidden())
-for name in {EXTRAS!r}:
+for name in {(*EXTRAS, *DRAWN_OR_COMPILED)!r}:
     sys.modules[name] = None
 from pipeline.cli import main
 main(sys.argv[1:])
@@ -69,11 +70,11 @@ def test_datasets_are_compared_without_what_draws_pages(tmp_path: Path) -> None:
     done = run_lean("compare", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "slip of warthog, from commands" in done.stdout
-    assert done.stdout.endswith("page    none: pip install 'slip-pipeline[report]' draws it\n")
+    assert done.stdout.endswith("page    none: pip install slip-pipeline draws it\n")
     assert (tmp_path / "results" / "comparisons.csv").is_file()
     refused = run_lean("compare", "--figures", "svg", cwd=tmp_path)
     assert refused.returncode == 1
-    assert "pip install 'slip-pipeline[report]'" in refused.stderr
+    assert "pip install slip-pipeline" in refused.stderr
 
 
 @pytest.mark.parametrize(
@@ -81,20 +82,14 @@ def test_datasets_are_compared_without_what_draws_pages(tmp_path: Path) -> None:
     few(
         [
             (
-                ("analyze", "a.mcap"),
-                (
-                    "needs numba, which is not installed. Install the extra: pip install 'slip-",
-                    "[diagnose]', or leave it out with --no-diagnosis.",
-                ),
+                ("analyze", "a.mcap", "--figures", "svg"),
+                ("a report needs vl_convert, which is not installed. Install it: pip install slip-pipeline",),
             ),
+            (("diagnose", "a.mcap"), ("needs numba, which is not installed.", "pip install slip-pipeline.")),
             (
-                ("analyze", "a.mcap", "--no-diagnosis"),
-                (
-                    "a report needs vl_convert, which is not installed.",
-                    "[report]', or leave it out with --no-report.",
-                ),
+                ("batch", ".", "--executor", "inline", "--settle", "0"),
+                ("pip install slip-pipeline, or leave it out with --no-diagnosis",),
             ),
-            (("diagnose", "a.mcap"), ("pip install 'slip-pipeline[diagnose]'",)),
             (
                 ("serve",),
                 (
@@ -114,6 +109,20 @@ def test_what_needs_an_extra_says_so_in_one_line(
     assert refused.returncode == 1
     assert [line for line in lines if line not in refused.stderr] == []
     assert "Traceback" not in refused.stderr
+
+
+def test_analyze_says_in_one_line_what_it_leaves_out(tmp_path: Path) -> None:
+    simulate_case("husky_tile", out=tmp_path / "a.mcap", duration_s=10.0)
+    done = run_lean("analyze", "a.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (line,) = [one for one in done.stderr.splitlines() if one.startswith("slip: ")]
+    assert line == (
+        "slip: left out, not installed: the effects (Numba) and the report (vl-convert); "
+        "to have it: pip install slip-pipeline"
+    )
+    assert "median slip modulus" in done.stdout
+    plain = run_lean("analyze", "a.mcap", "--no-diagnosis", "--no-report", cwd=tmp_path)
+    assert "left out" not in plain.stderr
 
 
 def test_what_is_there_is_not_refused() -> None:
@@ -138,7 +147,7 @@ def test_the_recipe_of_conda_needs_what_the_wheel_needs() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     recipe = yaml.safe_load((ROOT / "packaging" / "conda.yaml").read_text())
     extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["diagnose"], *extras["report"], *extras["serve"]]
+    wanted = [*project["dependencies"], *extras["serve"]]
     wanted = [one.replace(">=", " >=") for one in wanted if not one.startswith("slip-pipeline")]
     assert sorted(recipe["requirements"]["run"]) == sorted([*wanted, f"python {project['requires-python']}"])
     assert recipe["context"]["version"] == project["version"]

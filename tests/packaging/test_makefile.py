@@ -45,6 +45,7 @@ def test_make_alone_lists_the_verbs() -> None:
         "bench",
         "hidden-effect",
         "samples",
+        "release",
         "browser",
     ]
 

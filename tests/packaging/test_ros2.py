@@ -1,7 +1,9 @@
 """The ROS 2 package without ROS: files by the rules of their formats, command and launch on stand-ins."""
 
 import argparse
+import ast
 import importlib
+import os
 import re
 import runpy
 import sys
@@ -13,7 +15,6 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-import yaml
 from verbs import print_verb, run_verb
 
 from pipeline.simulate import simulate_case
@@ -46,13 +47,26 @@ def test_the_manifest_keeps_the_rules_of_format_3() -> None:
 @pytest.mark.lint
 def test_every_dependency_is_a_key_of_rosdep() -> None:
     package = ET.parse(PACKAGE / "package.xml").getroot()  # noqa: S314 - it is our own
-    keys = {child.text for child in package if child.tag in DEPENDS}
-    own = yaml.safe_load((PACKAGE.parent / "rosdep.yaml").read_text("utf-8"))
-    assert keys - OF_ROS == own.keys()
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["name"]
-    for systems in own.values():
-        assert {"ubuntu", "debian"} <= systems.keys()
-        assert all(rule == {"pip": {"packages": [project]}} for rule in systems.values())
+    assert {child.text for child in package if child.tag in DEPENDS} == OF_ROS
+
+
+@pytest.mark.lint
+def test_nothing_of_slip_is_imported_into_the_python_of_ros_and_humble_can_run_it() -> None:
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text("utf-8"), feature_version=(3, 10))
+        names = {
+            name.partition(".")[0]
+            for one in ast.walk(tree)
+            for name in (
+                [alias.name for alias in one.names]
+                if isinstance(one, ast.Import)
+                else [one.module or ""]
+                if isinstance(one, ast.ImportFrom)
+                else []
+            )
+        }
+        allowed = {"argparse", "launch", "ros2cli", "setuptools", "shutil", "subprocess", "sys", "__future__"}
+        assert names <= allowed, path
 
 
 @pytest.fixture
@@ -98,13 +112,30 @@ def command(installed: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> argpa
     "words", [("effects", "drive_lag", "--json"), ("effects", "no_such_effect"), ("analyze", "--help")]
 )
 def test_ros2_slip_does_what_slip_does(
-    words: tuple[str, ...], command: argparse.ArgumentParser, capfd: pytest.CaptureFixture[str]
+    words: tuple[str, ...],
+    command: argparse.ArgumentParser,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    program = tmp_path / "slip"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m pipeline "$@"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     expected = run_verb(*words)
     args = command.parse_args(["slip", *words])
     code = args.extension.main(parser=command, args=args)
     assert code == expected.returncode
     assert capfd.readouterr().out == expected.stdout
+
+
+def test_ros2_slip_without_a_slip_on_the_path_says_how_to_have_one(
+    command: argparse.ArgumentParser, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    args = command.parse_args(["slip", "doctor"])
+    assert args.extension.main(parser=command, args=args) == 1
+    assert capfd.readouterr().err.endswith("pipx install slip-pipeline\n")
 
 
 @dataclass
@@ -140,6 +171,5 @@ def test_the_launch_file_watches_a_folder(tmp_path: Path, monkeypatch: pytest.Mo
     simulate_case("husky_tile", out=tmp_path / "bags" / "run.mcap", duration_s=30.0)
     context |= {"folder": str(tmp_path / "bags"), "results": str(tmp_path / "results")}
     (process,) = start.named["function"](context)
-    python, *module, verb = process.named["cmd"][:4]
-    assert (python, module, verb) == (sys.executable, ["-m", "pipeline"], "watch")
-    assert "so far" in print_verb(*process.named["cmd"][3:], code=0)
+    assert process.named["cmd"][:2] == ["slip", "watch"]
+    assert "so far" in print_verb(*process.named["cmd"][1:], code=0)

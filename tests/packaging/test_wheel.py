@@ -86,7 +86,12 @@ def use_it(program: Path, wheel: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_wheel_analyzes_and_serves_in_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
+def test_the_wheel_analyzes_and_serves_in_a_bare_environment_and_leaves_it_bare(
+    wheel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
     environment = tmp_path / "bare"
     subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
     pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--quiet"]
@@ -94,6 +99,13 @@ def test_the_wheel_analyzes_and_serves_in_a_bare_environment(wheel: Path, tmp_pa
     subprocess.run([*pip, "--no-deps", str(wheel)], check=True)
 
     use_it(environment / "bin" / "slip", wheel, tmp_path)
+    assert list((tmp_path / "cache" / "slip" / "loops").rglob("*.nbc"))
+
+    subprocess.run([*pip[:3], "uninstall", "--quiet", "--yes", "slip-pipeline"], check=True)
+    (packages,) = (environment / "lib").glob("python*/site-packages")
+    remains = [name for name in ("pipeline", "schemas", "slip") if (packages / name).exists()]
+    assert remains == []
+    assert not (environment / "bin" / "slip").exists()
 
 
 @pytest.mark.long

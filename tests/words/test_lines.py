@@ -45,6 +45,20 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
     assert "(--all)" not in everything
 
 
+def test_the_first_line_says_which_runs_are_simulated() -> None:
+    runs = [RunDiagnosis(run=f"field/{number}", input="command") for number in range(5)]
+    first = [describe(runs[:1], simulated=names).splitlines()[0] for names in ([], ["field/0"])]
+    assert first == ["field/0    from commands", "field/0    simulated    from commands"]
+    assert describe(runs[:2], simulated=["field/0"]).splitlines()[:2] == [
+        "field/0    simulated",
+        "field/1    together, from commands",
+    ]
+    many = "5 runs, field/0 to field/4"
+    for names, text in ((["field/3"], "1 simulated"), ([run.run for run in runs], "all simulated")):
+        head = describe(runs, simulated=names).splitlines()[0]
+        assert head == f"{many}    {text}    together, from commands"
+
+
 LAGS = {"mean": "speed", "diff": "turning"}
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
@@ -20,7 +18,7 @@ ARGUMENTS = {
 def start_watch(context: LaunchContext) -> list[ExecuteProcess]:
     """The process that watches, with the options that are not empty."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    command = [sys.executable, "-m", "pipeline", "watch", given["folder"], "--results", given["results"]]
+    command = ["slip", "watch", given["folder"], "--results", given["results"]]
     options = {"--for": given["quiet_s"], "--vehicle": given["vehicle"]}
     for option, value in options.items():
         command += [option, value] if value else []

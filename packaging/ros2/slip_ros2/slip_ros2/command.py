@@ -1,8 +1,15 @@
-"""`ros2 slip VERB ...`: what `slip VERB ...` does."""
+"""`ros2 slip VERB ...`: what `slip VERB ...` does.
+
+The program is the `slip` of the path, a process of its own: it brings a newer numpy, and may need a newer
+Python, than the `ros2` that this file runs in (Python 3.10 in Humble).
+"""
 
 from __future__ import annotations
 
 import argparse
+import shutil
+import subprocess
+import sys
 
 from ros2cli.command import CommandExtension
 
@@ -21,10 +28,9 @@ class SlipCommand(CommandExtension):
     def main(self, *, parser: argparse.ArgumentParser, args: argparse.Namespace) -> int:
         """Run the verb; its exit code."""
         del parser
-        from pipeline.cli import main  # noqa: PLC0415 - `ros2` imports this file with every command
-
-        try:
-            main(args.words or ["help"])
-        except SystemExit as done:
-            return done.code if isinstance(done.code, int) else 0
-        return 0
+        program = shutil.which("slip")
+        if program is None:
+            print("ros2 slip: there is no `slip` on the path: pipx install slip-pipeline", file=sys.stderr)
+            return 1
+        command = [program, *(args.words or ["help"])]
+        return subprocess.run(command, check=False).returncode  # noqa: S603 - the user's words
