@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pipeline.core import SlipError
     from pipeline.datasets import Question
     from pipeline.estimation.estimates import list_parameters
-    from pipeline.export import list_left_out, require_errors
+    from pipeline.export import list_omitted, require_errors
     from pipeline.export.data_formats import dump_model
 else:
     __getattr__ = open_door(
@@ -59,7 +59,7 @@ else:
                 "expect_model",
                 "export_file",
                 "find_speeds",
-                "list_left_out",
+                "list_omitted",
                 "require_errors",
             ),
             "opening": (

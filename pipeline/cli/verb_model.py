@@ -265,7 +265,7 @@ def export(  # noqa: D417 - the options document themselves
         api.require_errors(to)
     runs = On(on=on, results=results).open() if on else ()
     text = api.export_file(opened, to, current=current, gate=gate, runs=runs)
-    for line in words.list_left_out(api.list_left_out(opened, to)):
+    for line in words.list_omitted(api.list_omitted(opened, to)):
         print_note(line)
     if file is None:
         sys.stdout.write(text)

@@ -191,7 +191,7 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
             where=facts.vehicle.id,
             hint="Export to another target: json and python take every vehicle.",
         )
-    doubtful = list_left_out(file, name)
+    doubtful = list_omitted(file, name)
     head = [
         f"{quote_name(facts.vehicle.name)}: {target.about}.",
         f"Names: {target.source}.",
@@ -208,7 +208,7 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
     return (target.write or write_yaml)(facts, table)
 
 
-def list_left_out(file: ModelFile, name: str) -> Mapping[str, Doubt]:
+def list_omitted(file: ModelFile, name: str) -> Mapping[str, Doubt]:
     """Values in doubt, by label, whose parameters a target leaves out, or has as comments only.
 
     Raises:

@@ -18,19 +18,19 @@ def write_json_object(file: ModelFile) -> str:
     return dump_model(file, file.list_doubts())
 
 
-def dump_model(file: ModelFile, left_out: Mapping[str, Doubt] = MappingProxyType({})) -> str:
+def dump_model(file: ModelFile, omitted: Mapping[str, Doubt] = MappingProxyType({})) -> str:
     """The model as JSON with values, intervals and units; numbers that are not finite become null.
 
     Args:
         file: the model.
-        left_out: doubts about values to leave out, by label.
+        omitted: doubts about values to leave out, by label.
     """
     vehicle = file.model.vehicle
     effects = []
     for effect in file.model:
         parameters = {}
         for parameter in effect.parameters:
-            if f"{effect.id}.{parameter.name}" in left_out:
+            if f"{effect.id}.{parameter.name}" in omitted:
                 continue
             low, high = file.intervals.get(f"{effect.id}.{parameter.name}", (math.nan, math.nan))
             one = file.find_doubt(effect, parameter)
@@ -58,7 +58,7 @@ def dump_model(file: ModelFile, left_out: Mapping[str, Doubt] = MappingProxyType
         },
         "effects": effects,
         "fit": _plain(file.fit),
-        **({"left_out": {label: doubt.reason for label, doubt in left_out.items()}} if left_out else {}),
+        **({"omitted": {label: doubt.reason for label, doubt in omitted.items()}} if omitted else {}),
         **({"warnings": warnings} if warnings else {}),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"

@@ -200,7 +200,7 @@ def suggest_export(kind: str, model: str) -> str:
     return f"slip model export {shlex.quote(model)} --to {_TARGETS.get(kind, 'json')}"
 
 
-def list_left_out(doubts: Mapping[str, Doubt]) -> list[str]:
+def list_omitted(doubts: Mapping[str, Doubt]) -> list[str]:
     """Notes beside an exported file: the values that it leaves out, and how they are written all the same."""
     lines = [f"left out: {label}: {doubt.reason}" for label, doubt in doubts.items()]
     return [*lines, "fixed = true beside a value in the model file exports it as your own"] if lines else []

@@ -9,7 +9,7 @@ from exported_files import HUSKY, make, read
 from verbs import run_verb
 
 from pipeline.api.fitted_model import Model
-from pipeline.export import export_model, list_left_out, list_targets
+from pipeline.export import export_model, list_omitted, list_targets
 from pipeline.models import (
     TOO_SHORT,
     Doubt,
@@ -61,8 +61,8 @@ def test_each_face_says_of_the_same_numbers_that_the_run_is_too_short(place: Pat
         "Python": dict(zip(frame["parameter"], frame["doubt"], strict=True)),
     }
     assert answers == dict.fromkeys(answers, expected)
-    left_out = dict.fromkeys(LABELS, REASON)
-    assert json.loads(exported.stdout)["left_out"] == left_out
+    omitted = dict.fromkeys(LABELS, REASON)
+    assert json.loads(exported.stdout)["omitted"] == omitted
     assert all(f"left out: {label}: {REASON}" in exported.stderr for label in LABELS)
     mark = Doubt(TOO_SHORT).mark
     for words in (["diagnose", RUN], ["diagnose", RUN, "--all"]):
@@ -105,12 +105,12 @@ def test_every_target_lists_what_it_leaves_out() -> None:
         intervals={"drive_lag.tau": (0.2, 0.4)}, doubts={"drive_lag.tau": Doubt("few_stretches", 3)},
     )  # fmt: skip
     for target in list_targets():
-        assert list_left_out(file, target.name) == ({} if target.takes_doubtful else file.doubts), target.name
+        assert list_omitted(file, target.name) == ({} if target.takes_doubtful else file.doubts), target.name
     assert "read from 3 of the driven stretches" in export_model(file, "python")
 
 
 def test_a_value_that_somebody_fixes_is_theirs() -> None:
     effect = find_effect("drive_lag")(tau=0.3).fix("tau")
     file = make(effect, vehicle=HUSKY, fit=FIT, doubts={"drive_lag.tau": Doubt(TOO_SHORT)})
-    assert not list_left_out(file, "nav2")
+    assert not list_omitted(file, "nav2")
     assert read("nav2", export_model(file, "nav2"))
