@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from pipeline.core import SlipError
     from pipeline.datasets import Question
     from pipeline.estimation.estimates import list_parameters
-    from pipeline.export import require_errors
+    from pipeline.export import list_omitted, require_errors
+    from pipeline.export.data_formats import dump_model
 else:
     __getattr__ = open_door(
         __name__,
@@ -55,9 +56,11 @@ else:
                 "carry_models",
                 "change_model",
                 "contest_models",
+                "dump_model",
                 "expect_model",
                 "export_file",
                 "find_speeds",
+                "list_omitted",
                 "require_errors",
             ),
             "opening": (

@@ -63,17 +63,20 @@ def tabulate_ladder(content: Mapping[str, object]) -> pl.DataFrame:
 
 
 def tabulate_parameters(numbers: Mapping[str, Mapping[str, object]]) -> pl.DataFrame:
-    """Numbers by ``effect.parameter``: value, 95 % interval (null without one), unit."""
+    """Numbers by ``effect.parameter``: value, 95 % interval (null without one), unit, id of its doubt."""
     rows = [
         {
             "parameter": label,
             **{key: number_in(number, key) for key in ("value", "low", "high")},
             "unit": str(number.get("unit", "1")),
+            "doubt": str(number.get("doubt", "")),
         }
         for label, number in numbers.items()
     ]
     values = dict.fromkeys(("value", "low", "high"), pl.Float64)
-    return pl.DataFrame(rows, schema={"parameter": pl.String, **values, "unit": pl.String})
+    return pl.DataFrame(
+        rows, schema={"parameter": pl.String, **values, "unit": pl.String, "doubt": pl.String}
+    )
 
 
 def write_html(title: str, frame: pl.DataFrame, notes: Sequence[str] = ()) -> str:

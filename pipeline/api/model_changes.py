@@ -13,7 +13,8 @@ from pipeline.datasets import ModelContest, ModelFit
 from pipeline.estimation.run_residuals import InputChoice, choose_input
 from pipeline.estimation.tolerance import SpeedLimit, limit_speeds, limits_as_json
 from pipeline.estimation.transfer import Transfer, carry_over
-from pipeline.export import export_model, read_current, require_errors  # noqa: F401 - the door offers it
+from pipeline.export import export_model, list_omitted, read_current, require_errors  # noqa: F401 - for the door
+from pipeline.export.data_formats import dump_model  # noqa: F401 - for the door
 from pipeline.models import ModelFile
 from pipeline.results import to_json
 from pipeline.run import MotionRun

@@ -16,6 +16,7 @@ from pipeline.cli.conventions import (
     OwnEffects,
     Results,
     print_lines,
+    print_note,
 )
 from pipeline.cli.model_runs import (
     Against,
@@ -86,7 +87,7 @@ def show(  # noqa: D417 - the shared option documents itself
     """
     file = open_model(model, effects)
     if json:
-        sys.stdout.write(api.export_file(file, "json"))
+        sys.stdout.write(api.dump_model(file))
         return CLEAN
     parameters = words.format_parameters(api.list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
@@ -171,7 +172,7 @@ def fit(  # noqa: D417 - the shared options document themselves
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
-        changed = replace(file, model=file.model.swap(*neutral), intervals={})
+        changed = replace(file, model=file.model.swap(*neutral), intervals={}, doubts={})
     return _change(model, file, changed, spoken, predict=predict or (), first_s=first_s, prior=prior)
 
 
@@ -264,6 +265,8 @@ def export(  # noqa: D417 - the options document themselves
         api.require_errors(to)
     runs = On(on=on, results=results).open() if on else ()
     text = api.export_file(opened, to, current=current, gate=gate, runs=runs)
+    for line in words.list_omitted(api.list_omitted(opened, to)):
+        print_note(line)
     if file is None:
         sys.stdout.write(text)
     else:

@@ -226,6 +226,12 @@ class RunsCheck:
         return any(math.isfinite(one.spread) for one in self.numbers if one.name != MULTIPLIER)
 
     @property
+    def is_single(self) -> bool:
+        """Whether there is one run a side, and nothing tells how much runs differ."""
+        counts = {len(side) for side in (self.sides.before, self.sides.after)}
+        return counts == {1} and not self.is_spread_known
+
+    @property
     def is_compared(self) -> bool:
         """Whether most of the model's numbers can be compared: a few do not show that nothing changed."""
         model = [one for one in self.numbers if one.name not in LOGARITHMS]
@@ -241,7 +247,8 @@ class RunsCheck:
         if self.list_status("changed"):
             return BROKEN
         unclear = [one for one in self.list_status("unclear") if one.name not in LOGARITHMS]
-        is_decided = self.is_compared and not unclear and not self.list_status("differs")
+        is_open = self.is_single or bool(unclear) or bool(self.list_status("differs"))
+        is_decided = self.is_compared and not is_open
         return KEPT if is_decided else UNDETERMINED
 
     def to_json(self, verdict: str, sentences: Sequence[str]) -> dict[str, object]:

@@ -92,7 +92,9 @@ class ModelFit:
                 for terrain, errors in measure_by_terrain(data, after.held_out).items()
             },
             "noise_floor": to_json(self.floor),
-            "parameters": parameters_as_json(self.after.fitted.model, self.after.estimates),
+            "parameters": parameters_as_json(
+                self.after.fitted.model, self.after.estimates, self.file.list_doubts()
+            ),
             "correlated": correlations_as_json(self.after.estimates),
             "timing": [
                 {

@@ -34,7 +34,16 @@ from pipeline.estimation.estimates import (
 from pipeline.estimation.ladder import ModelAssessment, assess_model, list_order, note_fit
 from pipeline.estimation.plausibility import measure_moves, note_unusual
 from pipeline.estimation.run_residuals import Input
-from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
+from pipeline.models import (
+    UNDECIDED,
+    Effect,
+    Late,
+    Model,
+    ModelFile,
+    find_effect,
+    find_late_effect,
+    format_model,
+)
 from pipeline.recording import Finding
 from pipeline.results import (
     Delays,
@@ -47,6 +56,7 @@ from pipeline.results import (
     Undecided,
     Unexplained,
     Unobservable,
+    Value,
 )
 from pipeline.run import MotionError
 
@@ -148,7 +158,11 @@ def summarize(
         vehicle=data.vehicle,
         effects=named,
         undecided=tuple(
-            replace(item, in_model=next((name for name in item.candidates if name in ids), None))
+            replace(
+                item,
+                in_model=next((name for name in item.candidates if name in ids), None),
+                parameters={name: _leave_open(values) for name, values in item.parameters.items()},
+            )
             for item in undecided
         ),
         unobservable_why=unobservable,
@@ -177,6 +191,14 @@ def summarize(
     estimates = tuple(number for one in assessments.values() for number in list_estimates(data, one, named))
     fitted = assessment.fitted if assessment else None
     return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
+
+
+def _leave_open(values: Mapping[str, Value]) -> dict[str, Value]:
+    """Values of one of several alternatives: each is undecided, unless there is a graver doubt."""
+    return {
+        name: replace(one, doubt=one.doubt if one.is_undetermined else UNDECIDED, stretches=0)
+        for name, one in values.items()
+    }
 
 
 def _find_unexplained(results: Sequence[PathResult], region: Region | None) -> Unexplained | None:

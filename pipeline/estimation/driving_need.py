@@ -11,12 +11,14 @@ from msgspec.structs import replace
 
 from pipeline.core import Floats, Ints, round_digits
 from pipeline.estimation.intervals import narrow_path
-from pipeline.models import find_effect
+from pipeline.estimation.window_residuals import count_seconds
+from pipeline.models import FEW_STRETCHES, FEWEST_STRETCHES, TOO_SHORT, Doubt, find_effect
 from pipeline.results import INTERVAL_SHARE, DataNeed, GrownEvidence, Growth, Narrowing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.model_fit import Fitted
     from pipeline.results import Named
 
@@ -30,12 +32,39 @@ _DIGITS = 4
 """Significant digits of a curve in JSON: a figure shows three."""
 
 
+# Eight steps of six seconds, and fifteen: with fewer, a delay or a terrain change imitates the true effect.
+_LEAST_DRIVING_S = {"measured": 48.0, "command": 90.0}
+
+
 @dataclass(frozen=True)
 class Curve:
     """Values by the seconds of driving, both of shape (k,)."""
 
     seconds: Floats
     values: Floats
+
+
+def measure_driven(data: EstimationData) -> tuple[float, float]:
+    """Seconds of driving, and how many are needed for a reliable identification."""
+    return float(count_seconds(data.whole).sum()), _LEAST_DRIVING_S[data.source.value]
+
+
+def find_doubts(data: EstimationData, fitted: Fitted) -> dict[str, Doubt]:
+    """What the driving makes doubtful of fitted parameters, by label ``effect.name``.
+
+    All of them where it is too short; else those whose information comes from a few blocks, counted as
+    the square of its sum over the sum of its squares: of blocks that inform equally, their number.
+    """
+    driven, least = measure_driven(data)
+    if driven < least:
+        return {number.label: Doubt(TOO_SHORT) for number in fitted.free if number.effect}
+    doubts = {}
+    for label, curve in narrow_intervals(fitted).items():
+        gained = np.diff(curve.values**-2.0, prepend=0.0).clip(0.0)
+        count = max(round(float(gained.sum() ** 2 / np.sum(gained**2))), 1) if gained.any() else 0
+        if 0 < count < FEWEST_STRETCHES:
+            doubts[label] = Doubt(FEW_STRETCHES, count)
+    return doubts
 
 
 def thin_growth(evidence: Curve | None, widths: Mapping[str, Curve]) -> Growth:

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite, round_digits
+from pipeline.estimation.driving_need import measure_driven
 from pipeline.estimation.fit import PathFit, find_unlearned, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
 from pipeline.estimation.ladder import ModelAssessment
 from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.model_state import ModelState, combine_columns
-from pipeline.estimation.window_residuals import count_seconds
 from pipeline.models import (
+    Doubt,
     Effect,
     Late,
     Model,
     ModelFile,
     Parameter,
     cut_interval,
+    doubt_number,
     is_of_one_run,
     list_effects,
     stands_at_bound,
@@ -44,28 +46,38 @@ if TYPE_CHECKING:
     from pipeline.core import Budget
     from pipeline.estimation.estimation_data import EstimationData
 
+_CERTAIN: Mapping[str, Doubt] = {}
 _PASSES = 2
 """Steps of the estimate of an effect that a model lacks, the noise learned anew after each."""
 
 
-def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
-    """Values of an effect with the intervals of a fit; NaN intervals where the fit has none."""
+def list_values(
+    effect: Effect, estimates: Estimates | None, doubts: Mapping[str, Doubt] = _CERTAIN
+) -> dict[str, Value]:
+    """Values of an effect with the intervals of a fit, NaN where the fit has none, and their doubts.
+
+    Args:
+        effect: with its values.
+        estimates: of the fit; None without one.
+        doubts: what the driving makes doubtful, by label; see `ModelAssessment.doubts`.
+    """
     known = {} if estimates is None else {item.free.label: item for item in estimates.items}
     values = {}
     for parameter in effect.parameters:
         value = effect.values[parameter.name]
         if not math.isfinite(value):
             continue
-        item = known.get(f"{effect.id}.{parameter.name}")
+        label = f"{effect.id}.{parameter.name}"
+        item = known.get(label)
         # As they are written: what is said of a stored answer is what was said of it at first.
         low, high = (math.nan, math.nan) if item is None else (_write(item.low), _write(item.high))
         at_bound = stands_at_bound(value, parameter.bounds)
         own = at_bound or is_of_one_run(effect.parameters)
         another = Interval() if own else expect_another_run(parameter, value, low, high)
-        one_sided = parameter.is_one_sided(low, high)
+        doubt = doubt_number(parameter, value, low, high) or doubts.get(label, Doubt())
         values[parameter.name] = Value(
-            value, low, high, parameter.unit, at_bound, another, one_sided,
-            is_spread_measured=parameter.between_runs is not None,
+            value, low, high, parameter.unit, at_bound, another,
+            is_spread_measured=parameter.between_runs is not None, doubt=doubt.id, stretches=doubt.stretches,
         )  # fmt: skip
     return values
 
@@ -154,14 +166,9 @@ def _overlaps(effect: Effect, model: Model) -> bool:
     return any(effect.id in one.contains or one.id in effect.contains for one in model)
 
 
-# Eight steps of six seconds, and fifteen: with fewer, a delay or a terrain change imitates the true effect.
-_LEAST_DRIVING_S = {"measured": 48.0, "command": 90.0}
-
-
 def note_brevity(data: EstimationData, common: RunDiagnosis) -> list[Finding]:
     """A finding where the driving is too short for reliable identification."""
-    least = _LEAST_DRIVING_S[common.input]
-    driven = float(count_seconds(data.whole).sum())
+    driven, least = measure_driven(data)
     if driven >= least:
         return []
     values = {"runs": len(data.runs), "driven_s": driven, "least_s": least, "input": common.input}
@@ -224,8 +231,10 @@ def _estimate_added(fit: PathFit, effect: Effect) -> list[Estimate]:
     ]
 
 
-def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
-    """Every parameter by ``effect.name``: value, 95 % interval, unit, and whether it was fitted."""
+def parameters_as_json(
+    model: Model, estimates: Estimates, doubts: Mapping[str, Doubt] = _CERTAIN
+) -> dict[str, dict[str, object]]:
+    """Every parameter by ``effect.name``: value, 95 % interval, unit, doubt, and whether it was fitted."""
     entries: dict[str, dict[str, object]] = {}
     for effect in model:
         for parameter in effect.parameters:
@@ -256,15 +265,16 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
     for label, rows in own.items():
         ordered = sorted(rows, key=lambda one: one[0])
         entries[label] |= {"fitted": True, "runs": [{"run": run, **entry} for run, entry in ordered]}
+    for label in entries.keys() & doubts.keys():
+        entries[label] |= {"doubt": doubts[label].id, "doubt_text": doubts[label].reason}
     return entries
 
 
 def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
     """Every parameter of a model file by ``effect.name``: intervals of its last fit, and doubts."""
-    parameters = parameters_as_json(file.model, NOT_FITTED)
+    parameters = parameters_as_json(file.model, NOT_FITTED, file.list_doubts())
     for label, (low, high) in file.intervals.items():
         parameters[label] |= {"low": _round(low), "high": _round(high)}
-    parameters |= {label: parameters[label] | {"doubt": text} for label, text in file.list_doubts().items()}
     for row in file.own_numbers:
         if (label := str(row.get("parameter"))) in parameters:
             cast("list[object]", parameters[label].setdefault("runs", [])).append(row)
@@ -302,7 +312,10 @@ def list_by_run(
     if assessment is None or effect.id not in assessment.fitted.model:
         return (list_values(effect, None),)
     acting = assessment.fitted.state.list_as_it_acts(assessment.fitted.model.effect(effect.id))
-    by_run = [list_values(one, assessment.estimates.choose_run(run)) for run, one in enumerate(acting)]
+    by_run = [
+        list_values(one, assessment.estimates.choose_run(run), assessment.doubts)
+        for run, one in enumerate(acting)
+    ]
     if effect.late is Late.POSES:
         # Where only some runs have a gyro, the delay that it corrected is part of the clock.
         by_run = [

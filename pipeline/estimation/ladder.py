@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.core import Floats, pick
+from pipeline.estimation.driving_need import find_doubts
 from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.floor import estimate_floor
@@ -19,7 +20,7 @@ from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
-from pipeline.models import Model, ModelFile, Timing
+from pipeline.models import Doubt, Model, ModelFile, Timing
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, Step, as_written, list_rises, to_json
 from pipeline.run import STILL_MPS
 
@@ -243,6 +244,12 @@ class ModelAssessment:
         return self.whole.fitted
 
     @cached_property
+    def doubts(self) -> dict[str, Doubt]:
+        """What the driving makes doubtful of its parameters, by label; nothing where a fleet adds to it."""
+        has_prior = any(path.prior.numbers for path in self.data.paths)
+        return {} if has_prior else find_doubts(self.data, self.fitted)
+
+    @cached_property
     def floor(self) -> Errors:
         """The noise floor of the runs, by what the physics leaves, and a suggested formula."""
         return estimate_floor(self.data, (self.suggested or self.whole).fitted.state)
@@ -274,6 +281,10 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     }
     data, estimates = assessment.data, assessment.estimates
     intervals |= estimates.shared_intervals
+    doubts = {
+        label: doubt for label, doubt in file.doubts.items() if label.partition(".")[0] not in fitted.ids
+    }
+    doubts |= assessment.doubts
     fit: dict[str, object] = {
         "input": data.source.value,
         "blocks": estimates.blocks,
@@ -320,7 +331,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
         ids = set(model.ids)
         undecided = [group for group in file.undecided if ids.intersection(group)]
         fit |= {key: rows for key, rows in (("undecided", undecided),) if rows}
-    return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)
+    return replace(file, model=model, per_run=per_run, intervals=intervals, doubts=doubts, fit=fit)
 
 
 def _measure_driven(data: EstimationData) -> list[dict[str, float]]:

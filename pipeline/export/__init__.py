@@ -13,12 +13,22 @@ import operator
 import pkgutil
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
-from pipeline.models import Effect, FormulaEffect, Model, ModelFile, Parameter, Quantity, is_own
+from pipeline.models import (
+    UNDECIDED,
+    Doubt,
+    Effect,
+    FormulaEffect,
+    Model,
+    ModelFile,
+    Parameter,
+    Quantity,
+    is_own,
+)
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, check_geometry
 
@@ -65,6 +75,7 @@ class Target:
         read_current: reads them from the text of the robot's file.
         has_errors: whether it writes held-out errors, for which a log may be given.
         gates: words that say whether a measured offset is applied, the first by default; empty without one.
+        takes_doubtful: whether values in doubt are written as others are, as for a whole model.
     """
 
     name: str
@@ -79,6 +90,7 @@ class Target:
     read_current: Callable[[str], Current] | None = None
     has_errors: bool = False
     gates: tuple[str, ...] = ()
+    takes_doubtful: bool = False
 
 
 @functools.cache
@@ -179,11 +191,13 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
             where=facts.vehicle.id,
             hint="Export to another target: json and python take every vehicle.",
         )
+    doubtful = list_omitted(file, name)
     head = [
         f"{quote_name(facts.vehicle.name)}: {target.about}.",
         f"Names: {target.source}.",
         facts.format_fit(),
         facts.vehicle.format_unknown(),
+        "What depends on a value in doubt is commented out." if doubtful else "",
     ]
     table = ParameterTable([line for line in head if line])
     for row in target.rows:
@@ -192,6 +206,15 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
     if target.complete is not None:
         target.complete(facts, table, *([gate or target.gates[0]] if target.gates else []))
     return (target.write or write_yaml)(facts, table)
+
+
+def list_omitted(file: ModelFile, name: str) -> Mapping[str, Doubt]:
+    """Values in doubt, by label, whose parameters a target leaves out, or has as comments only.
+
+    Raises:
+        MotionError: ``unknown_target``.
+    """
+    return {} if find_target(name).takes_doubtful else file.list_doubts()
 
 
 def _fill_row(row: Row, facts: Facts, table: ParameterTable, current: Current) -> None:
@@ -264,11 +287,13 @@ class Amount:
         value: in SI units.
         sources: a line for each parameter it was computed from; empty if nothing is known.
         effects: ids of the effects among them.
+        is_doubtful: whether one of the parameters is in doubt.
     """
 
     value: float
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
+    is_doubtful: bool = False
 
     def __neg__(self) -> Amount:
         return self.change(operator.neg)
@@ -283,13 +308,14 @@ class Amount:
 
         The effects of the given values are listed as sources, but not as effects covered by the result.
         """
-        return Amount(_compute(function, self, *given), _unite(self, *given), self.effects)
+        return replace(combine(function, self, *given), effects=self.effects)
 
 
 def combine(function: Callable[..., float], *amounts: Amount) -> Amount:
     """Apply a function to several values; the sources and effects are united."""
     effects = frozenset[str]().union(*(amount.effects for amount in amounts))
-    return Amount(_compute(function, *amounts), _unite(*amounts), effects)
+    is_doubtful = any(amount.is_doubtful for amount in amounts)
+    return Amount(_compute(function, *amounts), _unite(*amounts), effects, is_doubtful)
 
 
 def _compute(function: Callable[..., float], *amounts: Amount) -> float:
@@ -313,12 +339,14 @@ class Setting:
         value: value as written: a number, a switch or a word, or several in a row.
         sources: sources of the value.
         effects: ids of the effects that it covers.
+        is_doubtful: whether it depends on a value in doubt, so that it is written as a comment.
     """
 
     path: str
     value: float | bool | str | tuple[float, ...] | tuple[bool, ...]
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
+    is_doubtful: bool = False
 
 
 @dataclass
@@ -348,7 +376,8 @@ class ParameterTable:
     def _append(self, path: str, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
         require_plausible(path, *(value if isinstance(value, tuple) else (value,)))
         notes = (note,) if note else ()
-        self.settings.append(Setting(path, value, (*amount.sources, *notes), amount.effects))
+        sources = (*amount.sources, *notes)
+        self.settings.append(Setting(path, value, sources, amount.effects, amount.is_doubtful))
 
 
 class Facts:
@@ -371,17 +400,16 @@ class Facts:
     def take(self, quantity: Quantity) -> Amount:
         """Return a quantity; neutral and without sources if no effect of the model has it.
 
-        Formulas and Python effects of the user do not count, whatever their ids are; nor do parameters that
-        the fit did not determine, and effects with equally good alternatives.
+        Formulas and Python effects of the user do not count, whatever their ids are.
         """
-        values, sources, effects = [], [], []
+        values, sources, effects, is_doubtful = [], [], [], False
         for effect, parameter in self._list_numbers():
-            is_open = self.file.find_doubt(effect, parameter) or self.file.list_rivals(effect.id)
-            if quantity in parameter.quantities and not is_open:
+            if quantity in parameter.quantities:
+                is_doubtful |= bool(self.file.find_doubt(effect, parameter))
                 values.append(effect.values[parameter.name])
                 sources.append(self._format_source(effect, parameter))
                 effects.append(effect.id)
-        return Amount(_join(quantity, values), tuple(sources), frozenset(effects))
+        return Amount(_join(quantity, values), tuple(sources), frozenset(effects), is_doubtful)
 
     def find_variance(self, quantity: Quantity) -> Amount:
         """Variance of a quantity whose values add up, from their intervals; unknown if one has none."""
@@ -391,7 +419,7 @@ class Facts:
             if effect.id in taken.effects and quantity in parameter.quantities and interval is not None:
                 variances.append((0.5 * (interval[1] - interval[0]) / NORMAL_95) ** 2)
         value = math.fsum(variances) if len(variances) == len(taken.effects) else math.nan
-        return Amount(value, taken.sources, taken.effects)
+        return replace(taken, value=value)
 
     def measure(self, name: str) -> Amount:
         """Return a vehicle dimension by its field name; unknown if it is not given (NaN) or a stand-in."""
@@ -428,7 +456,7 @@ class Facts:
         """Dimension times its factor; unknown for a stand-in, whose value cancels out in limits."""
         dimension = self.measure(name)
         scaled = combine(operator.mul, dimension, self.take(factor))
-        return scaled if dimension.sources else Amount(scaled.value)
+        return scaled if dimension.sources else Amount(scaled.value, is_doubtful=scaled.is_doubtful)
 
     def find_largest_steering(self) -> Amount:
         """Steering angle at the largest command [rad]."""
@@ -477,7 +505,7 @@ class Facts:
         if not limit.is_known or limit.value <= most:
             return limit
         source = f"no more than was driven: {most:.3g} {unit} (99th percentile)"
-        return Amount(most, (*limit.sources, source), limit.effects)
+        return replace(limit, value=most, sources=(*limit.sources, source))
 
     def find_speed_acceleration(self) -> Amount:
         """Largest acceleration [m/s^2], from the command or from the wheels driving straight."""
@@ -543,13 +571,13 @@ class Facts:
         if label in self.file.intervals:
             low, high = self.file.intervals[label]
             text += f" (95 %: {low:.5g} to {high:.5g})"
-        if rivals := self.file.list_rivals(effect.id):
-            names = " or ".join(map(quote_name, rivals))
-            text += f", undecided: {names} would explain the data as well"
         if by_ground := self._list_by_ground(label):
             text += f", the mean of {', '.join(by_ground)}"
         doubt = self.file.find_doubt(effect, parameter)
-        return f"{text}, {doubt}" if doubt else text
+        if doubt.id == UNDECIDED:
+            names = " or ".join(map(quote_name, self.file.list_rivals(effect.id)))
+            return f"{text}, undecided: {names} would explain the data as well"
+        return f"{text}, {doubt.reason}" if doubt else text
 
     def _list_by_ground(self, label: str) -> list[str]:
         """Values of a parameter that grounds or runs have of their own; of many the least and the largest."""
@@ -621,10 +649,13 @@ def _list_lines(group: Mapping[str, Any], indent: str = "") -> Iterator[str]:
     for name, item in group.items():
         if isinstance(item, Setting):
             yield from (f"{indent}# {make_plain(line)}" for line in item.sources)
-            yield f"{indent}{name}: {_write_value(item.value)}"
+            yield f"{indent}{'# ' * item.is_doubtful}{name}: {_write_value(item.value)}"
         else:
-            yield f"{indent}{name}:"
-            yield from _list_lines(item, f"{indent}  ")
+            lines = list(_list_lines(item, f"{indent}  "))
+            # A group without values is no group for those who read it.
+            is_empty = all(line.lstrip().startswith("#") for line in lines)
+            yield f"{indent}{'# ' * is_empty}{name}:"
+            yield from lines
 
 
 def _write_value(value: object) -> str:

@@ -151,7 +151,7 @@ def _add_offset(facts: Facts, table: ParameterTable, gate: str) -> None:
     offset = facts.take(Quantity.STEERING_OFFSET)
     sign = "measured minus true angle: an offset to the left is a negative bias"
     table.add(f"{_ALL}.steer_bias", -offset, f"{_SIMULATOR}; {sign}")
-    if not offset.is_known:
+    if offset.is_doubtful or not offset.is_known:
         return
     condition, lower, turn = _find_condition(facts)
     table.head.append(
@@ -259,6 +259,7 @@ def _write_lines(facts: Facts, table: ParameterTable) -> str:
     text.write("#\n# Vehicle-Id Component-Id Name Value Type\n")
     for setting in table.settings:
         text.writelines(f"# {make_plain(line)}\n" for line in setting.sources)
+        text.write("# " * setting.is_doubtful)
         writer.writerow([1, 1, setting.path, setting.value, _REAL32])
     return text.getvalue()
 

@@ -25,6 +25,7 @@ from pipeline.models import (
     FormulaEffect,
     Lag,
     Model,
+    ModelFile,
     Place,
     Ramp,
     Written,
@@ -73,6 +74,13 @@ def write_function(model: Model) -> str:
     if lever_m:
         parts.append(f"\n        v_y = v_y + {lever_m!r} * v_w")
     return "".join([*parts, _TAIL])
+
+
+def _write_file(file: ModelFile) -> str:
+    """The function with the doubts about its values as comments above it."""
+    head, _, rest = write_function(file.model).partition("\n\n")
+    doubts = "".join(f"# In doubt: {label}: {doubt.reason}.\n" for label, doubt in file.list_doubts().items())
+    return f"{head}\n\n{doubts}{rest}"
 
 
 def _write_step(effect: Effect, vehicle: Vehicle) -> _Step:
@@ -273,5 +281,6 @@ PYTHON = Target(
     "python",
     "a function that predicts poses from commands",
     "the function's docstring",
-    write_file=lambda file: write_function(file.model),
+    write_file=_write_file,
+    takes_doubtful=True,
 )

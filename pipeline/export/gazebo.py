@@ -19,7 +19,10 @@ def _write_element(facts: Facts, table: ParameterTable) -> str:
     for setting in table.settings:
         for line in setting.sources:
             plugin.append(ET.Comment(_write_comment(line)))
-        ET.SubElement(plugin, setting.path.rpartition(".")[2]).text = repr(setting.value)
+        element = ET.Element(setting.path.rpartition(".")[2])
+        element.text = repr(setting.value)
+        commented = ET.Comment(f" {ET.tostring(element, encoding='unicode')} ")
+        plugin.append(commented if setting.is_doubtful else element)
     ET.indent(plugin)
     return ET.tostring(plugin, encoding="unicode") + "\n"
 

@@ -9,6 +9,7 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.models.catalogue import *
+    from pipeline.models.doubt import *
     from pipeline.models.effect import *
     from pipeline.models.expression import *
     from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written, list_terms
@@ -37,6 +38,16 @@ else:
                 "name_term",
                 "refuse_taken",
                 "suggest_manoeuvre",
+            ),
+            "doubt": (
+                "AT_BOUND",
+                "FEWEST_STRETCHES",
+                "FEW_STRETCHES",
+                "ONE_LIMIT",
+                "TOO_SHORT",
+                "UNDECIDED",
+                "Doubt",
+                "doubt_number",
             ),
             "effect": (
                 "ANY",
@@ -88,11 +99,9 @@ else:
                 "write_text",
             ),
             "parameter": (
-                "AT_BOUND",
                 "EXCEEDED_SHARE",
                 "LEAST_DELAY_S",
                 "OVERSHOOT",
-                "UNDETERMINED",
                 "Conditions",
                 "Excitation",
                 "Largest",

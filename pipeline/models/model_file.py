@@ -9,10 +9,11 @@ from pathlib import Path
 
 from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, shorten
 from pipeline.models.catalogue import find_effect, refuse_taken
+from pipeline.models.doubt import UNDECIDED, Doubt, doubt_number
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
-from pipeline.models.parameter import Parameter, stands_at_bound
+from pipeline.models.parameter import Parameter
 from pipeline.run import MotionError
 from pipeline.sources import (
     ConfigurationError,
@@ -27,7 +28,7 @@ from pipeline.sources import (
 FORMAT = 1
 """Version of the format of model files; other versions are rejected."""
 _SECTIONS = ("format", "vehicle", "effect", "fit", "note")
-_NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
+_NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run", "doubt", "stretches"}
 _ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."
 _ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
@@ -48,6 +49,7 @@ class ModelFile:
         model: vehicle and effects with their values.
         per_run: labels ``effect.name`` whose values are estimated per run.
         intervals: 95 % intervals of the last fit by label.
+        doubts: what the runs of the last fit make doubtful, by label; see `find_doubt` for all doubts.
         fit: record of the last fit: input, runs with hashes, delays, ladder; empty before the first fit.
         note: free text.
     """
@@ -55,6 +57,7 @@ class ModelFile:
     model: Model
     per_run: tuple[str, ...] = ()
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    doubts: Mapping[str, Doubt] = field(default_factory=dict)
     fit: Mapping[str, object] = field(default_factory=dict)
     note: str = ""
 
@@ -75,27 +78,25 @@ class ModelFile:
         """Ids of effects that explained the fitted runs as well as an effect of the model."""
         return [name for group in self.undecided if effect in group for name in group if name != effect]
 
-    def find_doubt(self, effect: Effect, parameter: Parameter) -> str:
-        """Reason why a value is not reliable, in words; empty where there is none.
+    def find_doubt(self, effect: Effect, parameter: Parameter) -> Doubt:
+        """The gravest doubt about a value: that of its numbers, its effect, or the runs of the fit.
 
-        In a fitted model, a parameter that is not fixed is undetermined without an interval, and where that
-        gives one limit only.
+        A value that is fixed is the user's own. In a fitted model another one is undetermined without an
+        interval.
         """
         value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
         if value == parameter.neutral or not math.isfinite(value) or parameter.name in effect.fixed:
-            return ""
-        if stands_at_bound(value, parameter.bounds):
-            return "at its bound: a limit of the search, not a measurement"
+            return Doubt()
         alone = {*self.per_run, *(row.get("parameter") for row in self.list_fitted("own"))}
-        own = label in alone or effect.id in alone
-        if self.list_fitted("runs") and label not in self.intervals and not own:
-            return "undetermined: the runs of the fit leave it open"
-        if parameter.is_one_sided(*self.intervals.get(label, (math.nan, math.nan))):
-            return "undetermined: its interval reaches a limit of the search"
-        return ""
+        interval = self.intervals.get(label)
+        if interval is None and (not self.list_fitted("runs") or not alone.isdisjoint({label, effect.id})):
+            # Nobody fitted it, or each run has its own.
+            interval = (value, value)
+        own = doubt_number(parameter, value, *(interval or (math.nan, math.nan)))
+        return own or Doubt(UNDECIDED if self.list_rivals(effect.id) else "") or self.doubts.get(label, own)
 
-    def list_doubts(self) -> dict[str, str]:
-        """Reasons why values are not reliable, by label ``effect.name``; see `find_doubt`."""
+    def list_doubts(self) -> dict[str, Doubt]:
+        """Doubts about values by label ``effect.name``; see `find_doubt`."""
         numbers = ((effect, parameter) for effect in self.model for parameter in effect.parameters)
         doubts = {f"{effect.id}.{one.name}": self.find_doubt(effect, one) for effect, one in numbers}
         return {label: doubt for label, doubt in doubts.items() if doubt}
@@ -189,6 +190,7 @@ class _Reader:
             ) from None
         self.per_run: list[str] = []
         self.intervals: dict[str, tuple[float, float]] = {}
+        self.doubts: dict[str, Doubt] = {}
 
     def read(self) -> ModelFile:
         """Parse the whole file."""
@@ -208,6 +210,7 @@ class _Reader:
             model=Model(vehicle, tuple(self._list_effects(vehicle))),
             per_run=tuple(self.per_run),
             intervals=self.intervals,
+            doubts=self.doubts,
             fit=fit if isinstance(fit, dict) else {},
             note=str(self.tree.get("note", "")),
         )
@@ -353,6 +356,13 @@ class _Reader:
                 what = f"low = {low:g} of {label} is above its high = {high:g}"
                 raise self._error(what, "Exchange them, or fit the model again.", at, key)
             self.intervals[label] = (low, high)
+        if "doubt" in raw:
+            count = raw.get("stretches", 0)
+            doubt = Doubt(str(raw["doubt"]), count if isinstance(count, int) else 0)
+            if not doubt.is_known:
+                what = f"the doubt {doubt.id!r} about {label} is not known"
+                raise self._error(what, "Omit it, or fit the model again.", at, key)
+            self.doubts[label] = doubt
         value = raw.get("value")
         if value is not None and not _is_number(value):
             raise self._error(f"the value of {label} is not a number", "Write value = 1.5.", at, key)

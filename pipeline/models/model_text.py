@@ -9,6 +9,7 @@ import tomlkit
 
 from pipeline.core import naming_os_errors, round_digits
 from pipeline.logs.index import SUFFIXES, stem_of
+from pipeline.models.doubt import Doubt
 from pipeline.models.effect import (
     Effect,
     Parameter,
@@ -122,7 +123,11 @@ def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | No
         parts.append("fixed = true")
     if file is not None and not {label, effect.id}.isdisjoint(file.per_run):
         parts.append("per_run = true")
-    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}"
+    noted = Doubt() if file is None else file.doubts.get(label, Doubt())
+    parts += [f"doubt = {format_value(noted.id)}"] * bool(noted)
+    parts += [f"stretches = {noted.stretches}"] * bool(noted.stretches)
+    said = Doubt() if file is None else file.find_doubt(effect.rounded, parameter)
+    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}" + (f"  # {said.reason}" if said else "")
 
 
 def _format_table(name: str, table: Mapping[str, object]) -> list[str]:

@@ -186,10 +186,6 @@ class Conditions:
         return self.largest.reaches(limit, of) and limit <= OVERSHOOT * self.exceeded.get(of, math.inf)
 
 
-UNDETERMINED = "undetermined"
-"""Mark of a fitted value that its runs do not determine."""
-AT_BOUND = "at its bound"
-"""Mark of one at a limit of the search."""
 _MARGIN = 1e-6
 """Distance from a bound, relative to the size of the bounds, within which fits stop."""
 

@@ -16,7 +16,7 @@ from pipeline.core import (
     objects_in,
     split_interval,
 )
-from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, name_term, suggest_manoeuvre
+from pipeline.models import Doubt, list_effects, name_term, suggest_manoeuvre
 from pipeline.recording import Finding
 from pipeline.report import (
     MISSING,
@@ -440,7 +440,7 @@ def _list_parameters(effect: Named) -> list[list[str | Cell]]:
     rows: list[list[str | Cell]] = []
     for key, value in effect.parameters.items():
         shown = "" if value.unit in {"1", ""} else set_squares(value.unit)
-        doubts = [AT_BOUND if value.at_bound else UNDETERMINED] if value.is_undetermined else []
+        doubts = [mark] if (mark := Doubt(value.doubt, value.stretches).mark) else []
         text, ends = _format_within(value.value, value.low, value.high)
         rows.append(
             [

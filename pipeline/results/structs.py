@@ -11,6 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from pipeline.core import JSON_DIGITS, count_places, finite_or_none
+from pipeline.models import ONE_LIMIT
 from pipeline.recording import Finding
 from pipeline.sources import Vehicle
 from pipeline.store import convert_stored
@@ -29,8 +30,9 @@ class Interval(msgspec.Struct, frozen=True):
 class Value(msgspec.Struct, frozen=True):
     """A value with its 95 % interval, NaN where there is none, and whether it is at its bound.
 
-    `another_run`: expected interval in another run on this ground. `one_sided`: `Parameter.is_one_sided`.
-    `is_spread_measured`: whether the spread between runs was measured, not only assumed.
+    `another_run`: expected interval in another run on this ground. `is_spread_measured`: whether the spread
+    between runs was measured, not only assumed. `doubt`: why it is not to be used as it stands, the id of a
+    `pipeline.models.Doubt`; empty without one. `stretches`: how many stretches it rests on, where few.
     """
 
     value: float
@@ -39,13 +41,14 @@ class Value(msgspec.Struct, frozen=True):
     unit: str = "1"
     at_bound: bool = False
     another_run: Interval = Interval()
-    one_sided: bool = False
     is_spread_measured: bool = False
+    doubt: str = ""
+    stretches: int = 0
 
     @property
     def is_undetermined(self) -> bool:
         """Whether the runs do not determine it: no finite interval, one limit only, or at its bound."""
-        return self.at_bound or self.one_sided or not math.isfinite(self.high - self.low)
+        return self.at_bound or self.doubt == ONE_LIMIT or not math.isfinite(self.high - self.low)
 
     @property
     def half(self) -> float:

@@ -6,6 +6,7 @@ import re
 from pipeline.core import split_interval
 from pipeline.estimation.additions import Addition
 from pipeline.models import (
+    Doubt,
     Effect,
     FormulaEffect,
     Model,
@@ -71,7 +72,12 @@ def _summarize(effect: Effect | type[Effect]) -> str:
 
 
 def show_parameter(
-    effect: Effect, parameter: Parameter, interval: tuple[float, float] | None, *, is_fitted: bool
+    effect: Effect,
+    parameter: Parameter,
+    interval: tuple[float, float] | None,
+    doubt: Doubt,
+    *,
+    is_fitted: bool,
 ) -> dict[str, object]:
     """A parameter as a slider.
 
@@ -79,6 +85,7 @@ def show_parameter(
         effect: with its values.
         parameter: of the effect.
         interval: 95 % interval; None without one.
+        doubt: why the value is not to be used as it stands.
         is_fitted: whether the value comes from a fit.
     """
     value = effect.values[parameter.name]
@@ -97,6 +104,7 @@ def show_parameter(
         "from": low,
         "to": high,
         "step": (high - low) / _STEPS,
+        "doubt": doubt.reason,
         "at_bound": value != parameter.neutral and stands_at_bound(value, parameter.bounds),
         "locked": parameter.name in effect.fixed,
         "undetermined": is_fitted and interval is None and parameter.name not in effect.fixed,

@@ -97,7 +97,8 @@ const buildSlider = (pane, effect, parameter) => {
     pane.resting = { effect: effect.id, parameter: name, value: Number(input.value) };
     pane.rest = setTimeout(() => pane.settle().then(() => pane.redraw()), REST_MS);
   });
-  const span = parameter.ends.length ? `95 %: ${parameter.ends.join(" to ").replaceAll("-", "−")}` : parameter.undetermined ? "not determined by this run" : "";
+  const doubt = parameter.doubt ? `: ${parameter.doubt}` : "";
+  const span = parameter.ends.length ? `95 %: ${parameter.ends.join(" to ").replaceAll("-", "−")}${doubt}` : parameter.undetermined ? "not determined by this run" : "";
   return h("div", { class: `slider${atBound ? " at-bound" : ""}` },
     h("div", { class: "named-value" }, h("span", { title: label }, effect.formula.length ? name : parameter.about), shown),
     input,

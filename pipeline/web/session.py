@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from pipeline.estimation.additions import explain_refusals, weigh_addition
-from pipeline.models import Effect, Model, ModelFile, find_effect, name_term
+from pipeline.estimation.driving_need import find_doubts
+from pipeline.models import Doubt, Effect, Model, ModelFile, find_effect, name_term
 from pipeline.results import Errors, RunDiagnosis, Step, read_diagnosed, read_model
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
@@ -28,6 +29,7 @@ class Edit:
         model: the model.
         order: ids of its effects in the order in which they were added.
         intervals: 95 % intervals by label ``effect.parameter``.
+        doubts: what the driving makes doubtful of the fitted values, by label.
         wheel_delay_s: delay of the recorded wheels [s].
         ladder: from the ideal model upwards.
         without: error over 2 s without one effect [m], by id.
@@ -39,6 +41,7 @@ class Edit:
     model: Model
     order: tuple[str, ...] = ()
     intervals: Mapping[str, tuple[float, float]]
+    doubts: Mapping[str, Doubt]
     wheel_delay_s: float = 0.0
     ladder: tuple[Step, ...] = ()
     without: Mapping[str, float]
@@ -157,6 +160,7 @@ class Session:
             model=model,
             ladder=(*step.ladder[:-1], self._measure(step.ladder[-1].effects, errors)),
             intervals={} if known is None else known.estimates.shared_intervals,
+            doubts={} if known is None else find_doubts(self.prepared.data, known.step.fitted),
             by_hand=known is None,
         )
         return self._push(changed)
@@ -210,6 +214,7 @@ class Session:
             model=model.swap(*(one.rounded for one in fitted)),
             order=tuple(order),
             intervals=judged.estimates.shared_intervals,
+            doubts=find_doubts(prepared.data, judged.step.fitted),
             wheel_delay_s=delay,
             ladder=(*below, self._measure(shown, judged.step.errors)),
             without={name: prepared.score(fitted - name, delay).t_mrmse_m for name in shown},
@@ -231,6 +236,8 @@ class Session:
 
 def open_session(prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Session:
     """A new session with the ideal model, fitted."""
-    step = Edit(said="ideal model", model=Model(prepared.vehicle), intervals={}, without={}, refused={})
+    step = Edit(
+        said="ideal model", model=Model(prepared.vehicle), intervals={}, doubts={}, without={}, refused={}
+    )
     fitted = Session(prepared, diagnosis, (step,)).fit()
     return Session(prepared, diagnosis, (replace(fitted.step, said=step.said),))

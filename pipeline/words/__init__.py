@@ -80,6 +80,7 @@ else:
                 "format_refusals",
                 "format_speed_limits",
                 "format_transfers",
+                "list_omitted",
                 "suggest_export",
             ),
             "objects": ("diagnosis_as_json",),

@@ -20,9 +20,8 @@ Line = tuple[str, str]
 _MOST = 3
 """Numbers in a sentence; the table lists all."""
 _HEAD = ("", "number", "before -> after", "difference [95 %]", "runs differ")
-_ONE_RUN = (
-    "how much runs of this robot differ without a change is not known: three runs a side, or other runs, tell"
-)
+_SPREAD_UNKNOWN = "how much runs of this robot differ without a change is not known"
+_ONE_RUN = f"{_SPREAD_UNKNOWN}: three runs a side, or other runs, tell"
 
 
 def format_check(check: RunsCheck) -> str:
@@ -30,7 +29,12 @@ def format_check(check: RunsCheck) -> str:
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
     sentences = []
-    if changed:
+    if check.is_single and known:
+        pair = "a model and one run" if check.sides.is_model else "one run a side"
+        apart = f"these recordings differ in {_list(differs)}, but " if differs else ""
+        sentences.append(f"Cannot tell: {pair}")
+        sentences.append(f"{apart}{_ONE_RUN}")
+    elif changed:
         sentences.append(f"Changed: {_list(changed)}")
     elif differs:
         sentences.append(f"No conclusion: the recordings differ in {_list(differs)}, but {_ONE_RUN}")
@@ -63,9 +67,15 @@ def _list(numbers: list[CheckedNumber]) -> str:
 
 
 def describe_change(number: CheckedNumber) -> str:
-    """A change in words: what, from where to where, and its p over all numbers."""
+    """A change in words: what, from where to where, and its p over all numbers.
+
+    A difference that nothing compares with how much runs differ has no p.
+    """
+    text = f"{number.title} {_format(number, number.before)} -> {_format(number, number.after)}"
+    if number.status != "changed":
+        return text
     p = f"p = {number.p_adjusted:.1g}" if number.p_adjusted >= 1e-4 else "p < 0.0001"  # noqa: PLR2004 - as many digits as are shown
-    return f"{number.title} {_format(number, number.before)} -> {_format(number, number.after)} ({p})"
+    return f"{text} ({p})"
 
 
 def _format(number: CheckedNumber, value: float) -> str:

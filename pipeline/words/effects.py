@@ -6,8 +6,7 @@ from functools import lru_cache
 
 from pipeline.core import format_interval, round_digits, split_interval, suffix_unit
 from pipeline.models import (
-    AT_BOUND,
-    UNDETERMINED,
+    Doubt,
     Effect,
     Late,
     Level,
@@ -169,9 +168,7 @@ def format_value(value: Value) -> str:
         text = format_interval(value.value, value.low, value.high, value.unit)
     elif math.isfinite(value.low):
         text += f" [{value.low:.3g}, {value.high:.3g}]"
-    if value.at_bound:
-        return f"{text} ({AT_BOUND})"
-    return f"{text} ({UNDETERMINED})" if value.is_undetermined else text
+    return f"{text} ({mark})" if (mark := Doubt(value.doubt, value.stretches).mark) else text
 
 
 def format_with_range(value: Value) -> str:

@@ -22,7 +22,7 @@ from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.estimation.transfer import Transfer
-from pipeline.models import AT_BOUND, UNDETERMINED
+from pipeline.models import Doubt
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, format_rises
 from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall
@@ -111,9 +111,7 @@ def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[st
             text = f"  {label:<32}{value:>12} {unit:<8}"
             if ends:
                 text += f"95 %: {' to '.join(ends)}"
-            elif row.get("fitted"):
-                text += UNDETERMINED
-            marks = [AT_BOUND] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
+            marks = [said] if (said := entry.get("doubt_text")) else []
             marks += ["not observable in these runs"] * (row.get("observable") is False)
             text += "".join(f"  ({mark})" for mark in marks)
             if "run" in row:
@@ -202,6 +200,12 @@ def suggest_export(kind: str, model: str) -> str:
     return f"slip model export {shlex.quote(model)} --to {_TARGETS.get(kind, 'json')}"
 
 
+def list_omitted(doubts: Mapping[str, Doubt]) -> list[str]:
+    """Notes beside an exported file: the values that it leaves out, and how they are written all the same."""
+    lines = [f"left out: {label}: {doubt.reason}" for label, doubt in doubts.items()]
+    return [*lines, "fixed = true beside a value in the model file exports it as your own"] if lines else []
+
+
 def format_refusals(refusals: Mapping[str, str]) -> str:
     """Refusals in one clause: `slope_drift is not supported by the data (the reduction is not significant)`.
 
@@ -232,7 +236,7 @@ def format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
         lines += describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
     if chosen.warning:
         lines.append(chosen.warning)
-    parameters = parameters_as_json(new.fitted.model, new.estimates)
+    parameters = parameters_as_json(new.fitted.model, new.estimates, fit.file.list_doubts())
     prior = fit.prior_as_json()
     lines += ["", "parameters", *format_parameters(parameters)]
     return [*lines, "", "prior", *format_parameters(prior)] if prior else lines

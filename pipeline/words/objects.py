@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.models import Doubt
 from pipeline.results import RunDiagnosis, Value, to_json
 from pipeline.words.effects import (
     describe_clause,
@@ -72,3 +73,4 @@ def _describe_effects(run: RunDiagnosis, content: dict[str, Any]) -> None:
 def _mark(entries: dict[str, Any], values: Mapping[str, Value]) -> None:
     for name, value in values.items():
         entries[name]["undetermined"] = value.is_undetermined
+        entries[name]["doubt_text"] = Doubt(value.doubt, value.stretches).reason

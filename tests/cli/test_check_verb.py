@@ -48,7 +48,7 @@ def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
     assert same.startswith("No change shown in 1 number")
     assert late.startswith("Changed: lag of the drive 0.3")
     assert "-> 1.2 s" in late
-    assert single.startswith("No conclusion: the recordings differ in lag of the drive 0.3")
+    assert single.startswith("Cannot tell: a model and one run. These recordings differ in lag of the drive")
     assert "how much runs of this robot differ without a change is not known" in single
 
 

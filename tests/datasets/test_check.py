@@ -1,6 +1,7 @@
 """A check of simulated runs: what changed is named, and limits are judged."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -106,6 +107,9 @@ def test_single_runs_that_differ_cannot_tell_and_other_runs_of_the_robot_can(
 
     assert found.code == UNDETERMINED
     assert [number.name for number in found.list_status("differs")] == [LAG]
+    assert format_check(found).startswith(
+        "Cannot tell: one run a side. These recordings differ in lag of the"
+    )
     assert "how much runs of this robot differ without a change is not known" in format_check(found)
     assert 0.0 < find(found, LAG).low < 0.15 < find(found, LAG).high
     assert ("", "intervals: of these recordings alone") in list_check_lines(found)
@@ -117,10 +121,27 @@ def test_single_runs_that_differ_cannot_tell_and_other_runs_of_the_robot_can(
     assert compare_sides(one, simulated=True).code == BROKEN, "runs of a simulation do not differ"
 
 
-def test_two_single_runs_that_are_alike_show_no_change(same: Sides) -> None:
-    found = compare_sides(replace(same, before=same.before[:1], after=same.after[:1]))
-    assert found.code == KEPT
-    assert "How much runs of this robot differ without a change is not known" in format_check(found)
+def test_one_run_a_side_cannot_tell_on_any_face_and_shows_the_table(same: Sides, late: Sides) -> None:
+    for after in (same.after, late.after):
+        found = compare_sides(replace(same, before=same.before[:1], after=after[:1]))
+        content = check_as_json(found)
+        screen = dict(list_check_lines(found))["verdict"]
+        faces = (str(content["verdict"]), format_markdown(found), format_junit(found), screen)
+        for said in ("Cannot tell: one run a side.", "ow much runs of this robot differ without a change"):
+            assert all(said in face for face in faces)
+        assert (found.code, content["kept"]) == (UNDETERMINED, None)
+        titles = {number.title for number in found.numbers}
+        assert all(any(title in text for _, text in list_check_lines(found)) for title in titles)
+        # A probability of a change needs to know how much runs differ.
+        assert not any("p <" in face or "p =" in face for face in faces)
+
+
+def test_a_screen_has_one_probability_a_row_and_only_of_what_changed(late: Sides) -> None:
+    found = compare_sides(late)
+    (changed,) = found.list_status("changed")
+    screen = " ".join(text for _, text in list_check_lines(found))
+    assert re.findall(r"(\S+ \S+) \(p [<=]", screen) == [f"{changed.after:.2g} {changed.unit}"]
+    assert len(re.findall(r"\bp (?:&lt;|=)", format_markdown(found))) == 1
 
 
 def make_readings(rng: np.random.Generator, shift: float = 0.0) -> tuple[RunReading, ...]:
