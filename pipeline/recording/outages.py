@@ -205,7 +205,7 @@ def find_outages(
 
 
 def _roll_given(name: str, moved: Floats | None, blocks: _Blocks, track_m: float | None) -> list[Floats]:
-    """Columns of a side of a vehicle whose track is given, that rolls as the body moves; none of any other."""
+    """Columns of a side that rolls as the body moves, by the track that is given; none without one."""
     if moved is None or track_m is None or name not in SIDES:
         return []
     half = 0.5 * track_m * (1.0 if name == "right" else -1.0)
