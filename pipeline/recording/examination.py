@@ -28,7 +28,7 @@ from pipeline.recording.roles import (
     name_sources,
     read_drives,
 )
-from pipeline.recording.signs import ask_axes, ask_frame, ask_mounting, ask_signs, ask_yaw_rate
+from pipeline.recording.signs import ask_axes, ask_frame, ask_mounting, ask_plane, ask_signs, ask_yaw_rate
 from pipeline.recording.timeouts import ask_delay, ask_timeout
 from pipeline.recording.units import ask_gyro, ask_metres, ask_units
 from pipeline.run import GROUND_UNOBSERVABLE, Alignment
@@ -112,6 +112,7 @@ QUESTIONS: tuple[Callable[[Case], Case], ...] = (
     ask_gyro,
     leave_out_of_ground,
     read_drives,
+    ask_plane,
     ask_frame,
     ask_whose_pose,
     # The command, and when it acts.

@@ -1116,9 +1116,14 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "motor_reversed": _motor_reversed,
     "wheel_dead": _wheel_dead,
     "encoder_dead": _encoder_dead,
-    "pose_undecided": "the body does not follow what drives it along the headings of {source}, and a little "
-    "across them: their frame may be turned by 90 degrees, which too little tells; it is taken as recorded "
-    "(heading_deg = {value:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)",
+    "pose_undecided": {
+        "heading": "the body does not follow what drives it along the headings of {source}, and a little "
+        "across them: their frame may be turned by 90 degrees, which too little tells; it is taken as "
+        "recorded (heading_deg = {value:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)",
+        "axis": "the body turns most about the {axis} axis of {source}, but no other signal follows that "
+        'clearly: z is taken to point up, as usual (up = "{axis}", or "-{axis}", under [pose] in run.toml '
+        'takes another axis, up = "z" settles it)',
+    },
     "pose_contradicted": {
         "configured": _pose_configured,
         "heading": "by the motion the heading of {source} is {offset_deg:.0f} degrees off (or as much less "
