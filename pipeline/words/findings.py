@@ -1055,6 +1055,9 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "wheels_scaled": _wheels_scaled,
     "command_scale": {
         "of the wheels": _command_scaled,
+        "of speeds alone": "in slow driving the wheels turn {forward:.2f} times as fast as commanded, in "
+        "turns their difference is {turning:.2f} times the commanded one (median): no single scale fits, and "
+        "the commands are taken as recorded",
         "without a unit": "the numbers of {source} have no sure unit: as they are read, they are multiplied "
         "by {value:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them",
