@@ -612,6 +612,21 @@ def _command_scaled(of: Values) -> str:
     return f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
 
 
+def _by_tape(of: Values) -> str:
+    """Lengths by what was measured by hand, as lines of run.toml, or gains of a body's motion."""
+    names = {"ahead": "drives", "turning": "turns"}
+    texts = []
+    for name in ("wheel_radius_m", "track_width_m", "ahead", "turning"):
+        if name not in of:
+            continue
+        value, low, high = (f"{one:.4g}" for one in of[name])
+        said = f"it {names[name]} {value} times what they say" if name in names else f"{name} = {value}"
+        texts.append(f"{said} ({low} to {high})")
+    lines = "lines of [vehicle] in run.toml, " if of["kind"] == "sides" else ""
+    shown = f"what was measured by hand and {of['source']} show ({lines}with what such measuring allows)"
+    return f"{shown}: {enumerate_texts(texts)}"
+
+
 def _preset_differs(of: Values) -> str:
     key, described = of["key"], f"{of['described']:.4g}"
     return (
@@ -1062,6 +1077,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         "by {value:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them",
     },
+    "lengths_by_tape": _by_tape,
     "poses_left_out": "{all} topics or frames hold poses: the {compared} with most messages were compared",
     "vehicle_choice": {"description": _preset_differs, "parameters": _controller_differs},
     "no_command": "the log contains no commands: it is analyzed from wheel encoders",
