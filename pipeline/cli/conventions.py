@@ -293,6 +293,10 @@ class Choices:
     track_width: Annotated[PositiveFloat | None, Parameter(help="track width [m], in place of a vehicle")] = (
         None
     )
+    drove: Annotated[str | None, Parameter(help="distance driven straight by a tape, for example 2.00m")] = (
+        None
+    )
+    turned: Annotated[PositiveFloat | None, Parameter(help="turns on the spot as counted")] = None
     dataset: Annotated[str | None, Parameter(help="dataset the run belongs to")] = None
     terrain: Annotated[str | None, Parameter(help="terrain driven on")] = None
     input: Annotated[Literal["command", "measured", "both"], Parameter(help="input of the ideal model")] = (
@@ -319,6 +323,20 @@ class Choices:
     results: Results = Path("results")
 
 
+def _parse_distance(text: str | None) -> float | None:
+    """A distance [m] with or without its unit.
+
+    Raises:
+        SlipError: ``bad_distance``.
+    """
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(m|cm|mm)?", text.strip())
+    if match is None or not float(match[1]):
+        raise SlipError("bad_distance", f"{text} is no distance", where="--drove", hint="Give one as 2.00m.")
+    return float(match[1]) * {"mm": 1e-3, "cm": 1e-2}.get(match[2], 1.0)
+
+
 def build_options(choices: Choices) -> Options:
     """Options of a job from the choices on the command line, without a report.
 
@@ -332,6 +350,7 @@ def build_options(choices: Choices) -> Options:
             "track_width_m": choices.track_width,
         },
         "run": {"dataset": choices.dataset, "terrain": choices.terrain},
+        "truth": {"distance_m": _parse_distance(choices.drove), "turns": choices.turned},
         "velocity": {"yaw": choices.yaw},
     }
     given = {section: {k: v for k, v in values.items() if v is not None} for section, values in said.items()}

@@ -82,7 +82,10 @@ def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
 def _explain_scale(
     neutral: Alignment, ratios: tuple[float, float], vehicle: Vehicle, *, body_commanded: bool
 ) -> tuple[Alignment, tuple[Finding, ...]]:
-    """One factor on the whole command, or the geometry of another vehicle where that contradicts turns."""
+    """One factor on the whole command, or the geometry of another vehicle where that contradicts turns.
+
+    A factor that makes turns worse is told, and not applied: a gain of the drive would have to undo it.
+    """
     forward, turning = ratios
     scales, other = (forward, forward), None
     values: dict[str, object] = {"kind": "of the wheels", "forward": forward}
@@ -90,6 +93,9 @@ def _explain_scale(
         values["turning"] = turning
         if not body_commanded and turning > 0.0:
             scales, other = _find_geometry(scales, turning, vehicle)
+        is_worse = turning <= 0.0 or abs(np.log(turning / forward)) >= abs(np.log(turning))
+        if other is None and is_worse:
+            values["kind"], scales = "of speeds alone", (1.0, 1.0)
     if other is not None:
         values["vehicle"] = pick(other, "name", "wheel_radius_m", "track_width_m")
     values |= {"value": scales[0], "turn_scale": scales[1]}

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core import Flags, Floats
+from pipeline.core import Flags, Floats, arrays
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.recording import topic_values
 from pipeline.recording.findings import Finding, StageError
@@ -234,6 +234,22 @@ def read_rates(columns: TopicColumns, times: Floats) -> dict[str, Floats]:
     return rates | {
         name: differentiate_angle(times, angle) for name, angle in position.items() if name not in rates
     }
+
+
+def read_angles(columns: TopicColumns, times: Floats) -> dict[str, Floats]:
+    """Angles of all joints by name, of positions or else of velocities.
+
+    Args:
+        columns: a topic whose type has wheels by name.
+        times: time of each message [s].
+    """
+    velocity, position = _read_series(columns)
+    turned = {
+        name: arrays.integrate_rate(times, np.nan_to_num(rate))
+        for name, rate in velocity.items()
+        if not _is_known(name, position, velocity)
+    }
+    return position | turned
 
 
 def _read_interfaces(

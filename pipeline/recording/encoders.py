@@ -3,13 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from pipeline.core import Floats
 from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.drive import choose_sides
 from pipeline.recording.findings import Finding
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, fit, measure_share
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, compare, fit, measure_share
 from pipeline.recording.readings import SIDES, Held
 from pipeline.sources import DriveForm, DriveSection
 
@@ -134,6 +135,17 @@ def snap(scale: float) -> float:
     return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
 
 
+def _explains_more(case: Case, factors: Mapping[str, float]) -> bool:
+    """Whether wheels with these factors explain the motion clearly better than without.
+
+    Circles of one radius are explained by any scale of a side: slip of a side is no scale of its encoder.
+    """
+    section = msgspec.structs.replace(case.complete().wheels, factors=dict(factors))
+    made = case.wheels.reading.explained
+    again = case.read(case.wheels.source, is_measured=True, section=section).explain(case.motion)
+    return again.blocks.size == made.blocks.size and compare(again.blocks, made.blocks) > CLEAR
+
+
 def ask_joints(case: Case) -> Case:
     """Correct single wheels that contradict all others of a topic of joints."""
     section, wheels, motion = case.complete().wheels, case.wheels, case.motion
@@ -153,6 +165,7 @@ def ask_joints(case: Case) -> Case:
     }
     factors, idle = find_odd_joints(turning, sides)
     factors = {joint: float(f"{factor:.4g}") for joint, factor in factors.items()}
+    factors = factors if _explains_more(case, factors) else {}
     for joint, factor in factors.items():
         values = {"joint": joint, "source": str(wheels.source), "factor": factor}
         line = ", ".join(f'"{name}" = {value:g}' for name, value in factors.items())
@@ -186,6 +199,8 @@ def ask_scales(case: Case) -> Case:
         high, low = (abs(np.log(counts[one] * case.vehicle.wheel_radius_m)) for one in (side, other))
         side, other = (other, side) if low - high > 0.5 * abs(np.log(scale)) else (side, other)
     factor = float(f"{1.0 / snap(counts[side] / counts[other]):.4g}")
+    if not _explains_more(case, {side: factor}):
+        return case
     values = {"side": side, "other": other, "factor": factor}
     line = f"factors = {{{side} = {factor:g}}}"
     case.correct("wheels", "side scale", values, line, {"factors": {side: factor}})

@@ -4,19 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from pipeline.core import SlipError
-from pipeline.recording.case import Candidate, Case, open_case
+from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_as_wheels
 from pipeline.recording.evidence import equal_motion
 from pipeline.recording.extract import Given
 from pipeline.recording.findings import Finding
-from pipeline.recording.geometry import Geometry, explain_wheels, roll_wheels
+from pipeline.recording.geometry import Geometry, explain_wheels
+from pipeline.recording.legs import ask_legs, ask_motion
 from pipeline.recording.lengths import ask_lengths
 from pipeline.recording.losses import ask_losses
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, measure_motion
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS
 from pipeline.recording.outages import ask_outages
 from pipeline.recording.publishers import ask_publishers
-from pipeline.recording.readings import SIDES, Reading
+from pipeline.recording.readings import Reading
 from pipeline.recording.roles import (
     ask_angle,
     ask_kind,
@@ -27,13 +28,12 @@ from pipeline.recording.roles import (
     name_sources,
     read_drives,
 )
-from pipeline.recording.signs import ask_axes, ask_frame, ask_mounting, ask_signs, ask_yaw_rate
+from pipeline.recording.signs import ask_axes, ask_frame, ask_mounting, ask_plane, ask_signs, ask_yaw_rate
 from pipeline.recording.timeouts import ask_delay, ask_timeout
 from pipeline.recording.units import ask_gyro, ask_metres, ask_units
 from pipeline.run import GROUND_UNOBSERVABLE, Alignment
 from pipeline.sources import (
     Configuration,
-    DriveForm,
     DriveSource,
     PoseContent,
     PoseSource,
@@ -100,25 +100,6 @@ class Recording:
         return max((one.margin or 0.0 for one in self.evidence if one.role != "gyro"), default=0.0)
 
 
-def ask_motion(case: Case) -> Case:
-    """The motion that all else is compared with: that of the poses, or else of the first wheels that turn."""
-    if case.has_pose:
-        return replace(case, motion=measure_motion(case.extraction.poses()))
-    for number, source in enumerate(case.sources.rank_drives("wheels")):
-        # Joints that steer are those of a car.
-        for kind in ("ackermann", "differential") if source.form is DriveForm.JOINTS else ("differential",):
-            reading = case.read(source, is_measured=True, kind=kind)
-            if kind == "ackermann" and len(reading.inputs) < len(SIDES):
-                continue
-            motion = roll_wheels(reading)
-            if motion.is_known:
-                wheels = Candidate(source, reading, number, is_measured=True)
-                return replace(
-                    case, motion=motion, wheels=wheels, sources=replace(case.sources, wheels=source)
-                )
-    return case
-
-
 def ask_driven(case: Case) -> Case:
     """What the wheels do of the command."""
     return replace(case, driven=explain_wheels(case.command.reading, case.wheels.reading))
@@ -127,9 +108,11 @@ def ask_driven(case: Case) -> Case:
 QUESTIONS: tuple[Callable[[Case], Case], ...] = (
     # What there is, and in which frame and of whom the motion is.
     ask_motion,
+    ask_legs,
     ask_gyro,
     leave_out_of_ground,
     read_drives,
+    ask_plane,
     ask_frame,
     ask_whose_pose,
     # The command, and when it acts.

@@ -19,6 +19,7 @@ from pipeline.recording.drive import (
     interpolate_readings,
     is_angle,
     is_of_wheels,
+    read_angles,
     read_joints,
     read_pair,
     read_rates,
@@ -625,6 +626,12 @@ class Extraction:
         columns, clock, order = self._require(source.signals[0].topic, held=False)
         times = self._seconds(clock.stamp)
         return times[order], {name: rate[order] for name, rate in read_rates(columns, times).items()}
+
+    def read_angles(self, source: DriveSource) -> dict[str, Floats]:
+        """Angles [rad] of all joints of a topic in order of time, by name."""
+        columns, clock, order = self._require(source.signals[0].topic, held=False)
+        angles = read_angles(columns, self._seconds(clock.stamp))
+        return {name: angle[order] for name, angle in angles.items()}
 
     @cached_property
     def _wheels(self) -> pl.DataFrame:

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -535,30 +536,34 @@ def _compare(chosen: Choice, given: Given) -> Choice:
     sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
     if sources.others.get("pose") or _may_be_odometry(sources.pose):
         ratings = rate_poses(given)
-        if ratings and ratings[0].same_as:
-            values = {
-                "kind": "is another",
-                "pose": str(ratings[0].source),
-                "same_as": str(ratings[0].same_as),
-            }
-            findings.append(Finding("pose_from_wheels", "error", "pose", values))
-        useless = ratings[0].refusal if ratings and ratings[0].stands else ""
-        if ratings and ratings[0].from_wheels and not ratings[0].same_as:
-            useless = (
-                "they are wheel odometry, not a localization: computed from the wheels, they say nothing of "
-                "the ground"
-            )
+        best = ratings[0] if ratings else None
+        useless = best.refusal if best is not None and best.stands else ""
+        # An odometry that is published twice measures the wheels all the same.
+        bare = chosen.sources if best is not None and best.same_as else replace_pose(sources, ratings)
         sources = replace_pose(sources, ratings)
-        if useless:
-            bare = replace(sources, pose=None)
+        if best is not None and best.from_wheels:
+            whose = f"those of {best.same_as}, " if best.same_as else ""
+            useless = (
+                f"they are wheel odometry, not a localization: {whose}computed from the wheels, they say "
+                "nothing of the ground"
+            )
+        if best is not None and useless:
+            bare = replace(bare, pose=None)
             alone = _let_wheels_stand_in(replace(chosen, sources=bare), replace(given, sources=bare))
-            if alone.recording is not None:
-                what = f"the poses of {ratings[0].source}: {useless}"
-                unused = Finding("numbers_not_used", "warning", ratings[0].source.topic, {"what": what})
+            # Speeds that are differences of late positions say little of the wheels.
+            least = _STEADY if best.same_as else -math.inf
+            if alone.recording is not None and alone.recording.margin > least:
+                what = f"the poses of {best.source}: {useless}"
+                unused = Finding("numbers_not_used", "warning", best.source.topic, {"what": what})
                 return replace(alone, findings=(*alone.findings, unused))
-        if useless and ratings[0].from_wheels:
-            only = {"kind": "is the only one"}
-            findings.append(Finding("pose_from_wheels", "error", str(ratings[0].source), only))
+        if best is not None and best.from_wheels:
+            why = (
+                {"kind": "is another", "pose": str(best.source), "same_as": best.same_as}
+                if best.same_as
+                else {"kind": "is the only one"}
+            )
+            where = "pose" if best.same_as else str(best.source)
+            findings.append(Finding("pose_from_wheels", "error", where, why))
     recording = examine(replace(given, sources=sources))
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
@@ -579,6 +584,8 @@ def _compare(chosen: Choice, given: Given) -> Choice:
     )
 
 
+_STEADY = 5.0
+"""Vuong's statistic of an odometry's speeds with the commands from which on they stand in for its poses."""
 _ASTRAY = 0.2
 """Share of a pose's path that the wheels do not explain, from which on it may be that of another body."""
 

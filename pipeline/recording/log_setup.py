@@ -10,11 +10,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from pipeline.core import SlipError
 from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
 from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.findings import Finding, Severity, blame_damage
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.recording.readings import SIDES
+from pipeline.recording.tape import measure_by_tape, tell_with
 from pipeline.recording.units import JOYSTICK
 from pipeline.run import Alignment
 from pipeline.sources import (
@@ -85,6 +87,24 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     )
     recorded = index.deployment
     require_messages(index)
+    by_tape = measure_by_tape(index, configuration)
+    try:
+        chosen, configuration = _choose(index, configuration, options)
+    except SlipError as error:
+        raise tell_with(error, by_tape) from None
+    chosen = replace(chosen, findings=(*chosen.findings, *by_tape))
+    if chosen.recording is not None:
+        configuration = chosen.recording.configuration
+    vehicle = chosen.vehicle
+    terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
+    dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
+    return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+
+
+def _choose(
+    index: LogIndex, configuration: Configuration, options: LogOptions
+) -> tuple[Choice, Configuration]:
+    """Vehicle and sources, and the configuration with what their names show."""
     chosen = choose(index, configuration, options.overrides)
     sides = _find_only_sides(index, chosen.sources)
     if sides is not None:
@@ -97,12 +117,7 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
         chosen = replace(taken, findings=(*taken.findings, finding))
     chosen = report_unused(chosen, index)
     require_sources(chosen, index, options)
-    if chosen.recording is not None:
-        configuration = chosen.recording.configuration
-    vehicle = chosen.vehicle
-    terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
-    dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
-    return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+    return chosen, configuration
 
 
 def report_unused(chosen: Choice, index: LogIndex) -> Choice:

@@ -286,11 +286,12 @@ NO_MOTION = Motion(Steps(_NOTHING, _NOTHING), np.zeros(0, dtype=np.complex128), 
 """A motion of which too little is recorded."""
 
 
-def measure_motion(poses: pl.DataFrame) -> Motion:
+def measure_motion(poses: pl.DataFrame, *, is_level: bool = False) -> Motion:
     """Increments of the poses over steps of a tenth of a second or of their period.
 
     Args:
         poses: table `poses` as extracted.
+        is_level: whether the plane of motion is across z, whatever the poses show.
 
     Returns:
         The motion; `NO_MOTION` with fewer than thirty steps.
@@ -310,7 +311,7 @@ def measure_motion(poses: pl.DataFrame) -> Motion:
         return NO_MOTION
     time, position, quaternion = time[rows], position[rows], quaternion[rows]
     segment = fresh["segment"].to_numpy()[rows]
-    axis, up, yaw = _find_plane(position, quaternion)
+    axis, up, yaw = _find_plane(position, quaternion, is_level=is_level)
     first, second = _PLANES[axis]
     # A positive turn about y leads from x to -z.
     plane = position[:, first] + (-1j if axis == 1 else 1j) * position[:, second]
@@ -342,7 +343,7 @@ def _choose_rows(time: Floats, length: float) -> list[int]:
     return rows
 
 
-def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
+def _find_plane(position: Floats, quaternion: Floats, *, is_level: bool) -> tuple[int, str, Floats]:
     """Index of the axis across the plane of motion, its name, and the headings about it.
 
     The usual axis is z. Another one counts if the body turns most about it and moves along it least, and no
@@ -358,7 +359,7 @@ def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]
     since = rigid.multiply_quaternions(quaternion, rigid.invert_quaternions(quaternion[:1]))
     tilted = float(np.quantile(rigid.find_heights(since), 0.05))
     is_steep = tilted < _STEEPEST or extent[_Z] > math.hypot(extent[0], extent[1])
-    if axis != _Z and not (is_steep and int(np.argmin(extent)) == axis):
+    if axis != _Z and (is_level or not (is_steep and int(np.argmin(extent)) == axis)):
         axis = _Z
     if axis == _Z:
         yaw = rigid.euler_from_quaternions(quaternion)[2]

@@ -33,6 +33,11 @@ _SMALLEST_PART = 20
 """Least number of blocks of the part of a run in which an encoder may have been alive."""
 _PARTS = 8
 """Number of parts of the finest division in which a living encoder is looked for."""
+_ALONG = 0.1
+"""Extent of a drive across its main direction, of speeds and yaw rates, over that along it, from which on it
+tells of both: noise of poses is less."""
+_ASIDE = 0.3
+"""Part of a block's drive across it, over all drives' root mean square, of which it tells nothing."""
 _EXACT = 0.95
 """Share of the readings that are one value, from which on an encoder holds it."""
 
@@ -104,10 +109,12 @@ class _Follows:
     Attributes:
         expected: shape (m,).
         scale: of the noise.
+        told: whether the blocks of the fit tell what it would be in each block, shape (m,).
     """
 
     expected: Floats
     scale: float
+    told: Flags
 
     def rate(self, values: Floats) -> Floats:
         """Log-likelihood of every block, shape (m,)."""
@@ -116,7 +123,26 @@ class _Follows:
 
 def _fit(columns: Floats, values: Floats, rows: Flags, least: float) -> _Follows:
     gains, rest = fit_robustly(columns[rows], values[rows])
-    return _Follows(columns @ gains, float(np.hypot(find_scale(rest), least)))
+    told = _find_told(columns[:, : columns.shape[1] // 3], rows)
+    return _Follows(columns @ gains, float(np.hypot(find_scale(rest), least)), told)
+
+
+def _find_told(moved: Floats, rows: Flags) -> Flags:
+    """Whether some blocks drive as each block does, shape (m,): pivots about a wheel tell of no others.
+
+    Args:
+        moved: rates ahead and of the heading, shape (m, 2), or of the wheels that are given, shape (m, 1), by
+            which alone nothing is dead.
+        rows: blocks of which is known how a side turns with them, shape (m,).
+    """
+    if moved.shape[1] == 1:
+        return np.zeros(rows.size, dtype=bool)
+    size = np.sqrt((moved**2).mean(axis=0))
+    drives = moved / np.where(size > 0.0, size, 1.0)
+    _, extent, axes = np.linalg.svd(drives[rows], full_matrices=False)
+    unknown = axes[extent < _ALONG * extent[0]]
+    aside = np.abs(drives @ unknown.T).max(axis=1, initial=0.0)
+    return np.asarray(aside < _ASIDE, dtype=bool)
 
 
 def find_outages(
@@ -124,6 +150,7 @@ def find_outages(
     late: tuple[float, float],
     command: Reading,
     motion: Motion,
+    track_m: float | None = None,
 ) -> list[Outage]:
     """Spans in which a side's encoder reads nothing.
 
@@ -132,6 +159,7 @@ def find_outages(
         late: lag and delay of the motion after the wheels [s].
         command: fitted to the motion; nothing without one that is followed.
         motion: of the poses; `NO_MOTION` where no pose is recorded.
+        track_m: distance of the sides, if it is given: what turns as these wheels would is no dead encoder.
     """
     if motion.is_known:
         steps = motion.steps
@@ -155,7 +183,8 @@ def find_outages(
     if not sources:
         # Nothing tells when they should turn.
         return []
-    read = {name: _read_side(side, late, blocks, known, sources) for name, side in sides.items()}
+    of_side = {name: [*sources, *_roll_given(name, moved, blocks, track_m)] for name in sides}
+    read = {name: _read_side(side, late, blocks, known, of_side[name]) for name, side in sides.items()}
     goes_on = None
     if moved is not None and asked is not None:
         goes_on = _rate_going_on(moved, sources[1], known)
@@ -171,8 +200,16 @@ def find_outages(
             # With one witness alone the other side is the second one.
             others = [other for key, other in read.items() if key != name and other is not None]
             beside = others[0].usual - others[0].broad if others else np.zeros(known.size)
-        outages += _list_dead(name, side, late[1], blocks, one, sources, beside)
+        outages += _list_dead(name, side, late[1], blocks, one, of_side[name], beside)
     return _join_sides(sorted(outages, key=lambda one: one.start))
+
+
+def _roll_given(name: str, moved: Floats | None, blocks: _Blocks, track_m: float | None) -> list[Floats]:
+    """Columns of a side that rolls as the body moves, by the track that is given; none without one."""
+    if moved is None or track_m is None or name not in SIDES:
+        return []
+    half = 0.5 * track_m * (1.0 if name == "right" else -1.0)
+    return [blocks.spread((moved[:, 0] + half * moved[:, 1])[:, None])]
 
 
 @dataclass(frozen=True)
@@ -261,7 +298,7 @@ def _list_dead(
         goes_on: gain in likelihood where the other signals agree, shape (m,).
     """
     gains = np.column_stack((_rate_repeating(one.values, one.fits), one.broad)) - one.usual[:, None]
-    gains[~one.there] = 0.0
+    gains[~(one.there & np.any([fit.told for fit in one.fits], axis=0))] = 0.0
     price, made = price_change(one.values.size), list[Outage]()
     ends = np.append(blocks.steps.start[blocks.begins], np.inf)
     ends[0] = -np.inf
@@ -401,7 +438,8 @@ def ask_outages(case: Case) -> Case:
     late = (reading.explained.lag, reading.explained.delay)
     asked = case.command.reading if case.command.is_sure else Reading()
     poses = case.motion if case.has_pose else NO_MOTION
-    outages = find_outages(sides, late, asked, poses)
+    track_m = case.vehicle.track_width_m if case.is_known and reading.form == "sides" else None
+    outages = find_outages(sides, late, asked, poses, track_m)
     if not outages:
         return case
     kind = "ackermann" if reading.form == "steering" else "differential"

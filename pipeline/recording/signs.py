@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
 from pipeline.recording.findings import Finding
-from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit
+from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit, measure_motion
 from pipeline.recording.readings import DELAYS_S, Reading
 from pipeline.sources import PoseContent
 
@@ -27,7 +27,7 @@ def ask_frame(case: Case) -> Case:
         return case
     turned, margin, other_deg = find_frame(case.motion, [drive.reading for drive in case.drives])
     if other_deg is not None and section.heading_deg is None:
-        values = {"value": other_deg, "source": str(source)}
+        values = {"kind": "heading", "value": other_deg, "source": str(source)}
         case.findings.append(Finding("pose_undecided", "warning", "pose", values))
     if not margin:
         return case
@@ -44,6 +44,26 @@ def ask_frame(case: Case) -> Case:
         flipped = {"value": margin, "source": str(source)}
         case.findings.append(Finding("pose_flipped", "error", "pose", flipped))
     return case.fit(turned)
+
+
+def ask_plane(case: Case) -> Case:
+    """The plane of the motion: across another axis than z only where a signal clearly agrees, and better."""
+    if not case.has_pose or case.motion.up == "z":
+        return case
+    level = case.fit(measure_motion(case.extraction.poses(), is_level=True))
+    margin = _rate_followed(case)
+    if margin > max(CLEAR, _rate_followed(level)) or not level.motion.is_known:
+        return case
+    if case.drives:
+        about = {"kind": "axis", "axis": case.motion.up, "source": str(case.sources.pose)}
+        case.findings.append(Finding("pose_undecided", "warning", "pose", about))
+    return level
+
+
+def _rate_followed(case: Case) -> float:
+    """Vuong's statistic of the motion with the signal that it follows best; zero where none is clear."""
+    made = [one.explained for one in (case.gyro, *(drive.reading for drive in case.drives))]
+    return max((one.moves for one in made if one.is_sure), default=0.0)
 
 
 def ask_signs(case: Case) -> Case:

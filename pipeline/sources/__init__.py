@@ -44,6 +44,7 @@ else:
                 "DriveSection",
                 "IntervalSection",
                 "OutageSection",
+                "TruthSection",
                 "OwnUnit",
                 "PoseSection",
                 "StandIn",

@@ -129,6 +129,18 @@ class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     terrain: str | None = None
 
 
+class TruthSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[truth]``: what was measured by hand, for a log without any localization.
+
+    Attributes:
+        distance_m: distance between start and end of a straight drive by a tape, to 5 mm or 0.5 %.
+        turns: whole and part turns on the spot as counted, to a tenth.
+    """
+
+    distance_m: Positive | None = None
+    turns: Positive | None = None
+
+
 class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``ignore`` of ``[wheels]``: readings that are none, of one side or of both.
 
@@ -293,6 +305,7 @@ class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     vehicle: VehicleSection = VehicleSection()
     run: RunSection = RunSection()
+    truth: TruthSection = TruthSection()
     command: DriveSection = DriveSection()
     wheels: DriveSection = DriveSection()
     pose: PoseSection = PoseSection()

@@ -614,6 +614,21 @@ def _command_scaled(of: Values) -> str:
     return f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
 
 
+def _by_tape(of: Values) -> str:
+    """Lengths by what was measured by hand, as lines of run.toml, or gains of a body's motion."""
+    names = {"ahead": "drives", "turning": "turns"}
+    texts = []
+    for name in ("wheel_radius_m", "track_width_m", "ahead", "turning"):
+        if name not in of:
+            continue
+        value, low, high = (f"{one:.4g}" for one in of[name])
+        said = f"it {names[name]} {value} times what they say" if name in names else f"{name} = {value}"
+        texts.append(f"{said} ({low} to {high})")
+    lines = "lines of [vehicle] in run.toml, " if of["kind"] == "sides" else ""
+    shown = f"what was measured by hand and {of['source']} show ({lines}with what such measuring allows)"
+    return f"{shown}: {enumerate_texts(texts)}"
+
+
 def _preset_differs(of: Values) -> str:
     key, described = of["key"], f"{of['described']:.4g}"
     return (
@@ -1057,10 +1072,14 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "wheels_scaled": _wheels_scaled,
     "command_scale": {
         "of the wheels": _command_scaled,
+        "of speeds alone": "in slow driving the wheels turn {forward:.2f} times as fast as commanded, in "
+        "turns their difference is {turning:.2f} times the commanded one (median): no single scale fits, and "
+        "the commands are taken as recorded",
         "without a unit": "the numbers of {source} have no sure unit: as they are read, they are multiplied "
         "by {value:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them",
     },
+    "lengths_by_tape": _by_tape,
     "poses_left_out": "{all} topics or frames hold poses: the {compared} with most messages were compared",
     "vehicle_choice": {"description": _preset_differs, "parameters": _controller_differs},
     "no_command": "the log contains no commands: it is analyzed from wheel encoders",
@@ -1118,9 +1137,14 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "motor_reversed": _motor_reversed,
     "wheel_dead": _wheel_dead,
     "encoder_dead": _encoder_dead,
-    "pose_undecided": "the body does not follow what drives it along the headings of {source}, and a little "
-    "across them: their frame may be turned by 90 degrees, which too little tells; it is taken as recorded "
-    "(heading_deg = {value:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)",
+    "pose_undecided": {
+        "heading": "the body does not follow what drives it along the headings of {source}, and a little "
+        "across them: their frame may be turned by 90 degrees, which too little tells; it is taken as "
+        "recorded (heading_deg = {value:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)",
+        "axis": "the body turns most about the {axis} axis of {source}, but no other signal follows that "
+        'clearly: z is taken to point up, as usual (up = "{axis}", or "-{axis}", under [pose] in run.toml '
+        'takes another axis, up = "z" settles it)',
+    },
     "pose_contradicted": {
         "configured": _pose_configured,
         "heading": "by the motion the heading of {source} is {offset_deg:.0f} degrees off (or as much less "

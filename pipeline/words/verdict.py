@@ -112,7 +112,8 @@ def _format_nothing(run: RunDiagnosis) -> list[str]:
         return [*sentences, "The budget ended the search for effects early"]
     if not list_excess(run):
         return [*sentences, "The noise floor of this run is not known"]
-    if measure_excess(run) < ABOVE_FLOOR and run.unexplained is None:
+    is_named = run.unexplained is not None and run.unexplained.with_formula is not None
+    if measure_excess(run) < ABOVE_FLOOR and not is_named:
         is_at_floor = format_excess(measure_excess(run)) == format_excess(1.0)
         return sentences or [NOTHING_MISSING if is_at_floor else _NOTHING_EVIDENT]
     if run.undecided:

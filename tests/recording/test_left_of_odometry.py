@@ -12,6 +12,7 @@ from drawn_drives import (
     DrawnTopic,
     draw_drive,
     record_cdr,
+    record_json,
     record_twist,
     stamp_ros,
     write_drawn,
@@ -118,6 +119,48 @@ def test_a_copy_of_wheel_odometry_is_found_though_of_each_other_messages_are_lef
     ]
     found = {one.id: format_finding(one) for one in look(tmp_path / "log.mcap", topics).choice.findings}
     assert "it is that of /odom" in found["pose_from_wheels"]
+
+
+@pytest.mark.parametrize("copy", ["/base_pose", "/pose", "/tf"])
+def test_an_odometry_that_another_topic_repeats_still_measures_the_wheels(copy: str, tmp_path: Path) -> None:
+    of = drive()
+    # What the wheels do: late, and no faster than they can.
+    does = replace(
+        of,
+        speed=np.minimum(0.6, np.interp(of.time - 0.2, of.time, of.speed)),
+        turn=np.interp(of.time - 0.2, of.time, of.turn),
+    )
+    yaw = np.cumsum(does.turn) * np.gradient(of.time)
+    x, y = (np.cumsum(does.speed * part) * np.gradient(of.time) for part in (np.cos(yaw), np.sin(yaw)))
+    does = replace(does, x=x, y=y, yaw=yaw)
+    poses = stamp_ros(does) | does.pose("pose.pose.") | {"header.frame_id": "odom"}
+    twist = {"twist.twist.linear.x": does.speed, "twist.twist.angular.z": does.turn}
+    odometry = record_cdr(does, "/odom", "nav_msgs/msg/Odometry", poses | twist)
+    if copy == "/tf":
+        half = 0.5 * yaw
+        transforms = [
+            {
+                "header": {"stamp": {"sec": at // 10**9, "nanosec": at % 10**9}, "frame_id": "odom"},
+                "child_frame_id": "base_link",
+                "transform": {
+                    "translation": {"x": float(x[row]), "y": float(y[row]), "z": 0.0},
+                    "rotation": {"x": 0.0, "y": 0.0, "z": np.sin(half[row]), "w": np.cos(half[row])},
+                },
+            }
+            for row, at in enumerate(does.stamps.tolist())
+        ]
+        messages = [{"transforms": [one]} for one in transforms]
+        again = record_json(does, "/tf", "tf2_msgs/msg/TFMessage", messages)
+    elif copy == "/pose":
+        fields = stamp_ros(does) | does.pose("pose.") | {"header.frame_id": "odom"}
+        again = record_cdr(does, copy, "geometry_msgs/msg/PoseStamped", fields)
+    else:
+        again = record_cdr(does, copy, "nav_msgs/msg/Odometry", poses)
+    setup = look(tmp_path / "log.mcap", [record_twist(of), odometry, again])
+    said = " ".join(format_finding(one) for one in setup.choice.findings)
+    assert str(setup.sources.pose.wheels) == "/odom"
+    assert "they are wheel odometry, not a localization" in said
+    assert "pose_from_wheels" not in {one.id for one in setup.choice.findings}
 
 
 def test_of_wheels_beside_which_nothing_is_left_no_outage_is_said() -> None:

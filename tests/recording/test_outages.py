@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_motion import Drive, command, draw, measured, sides, tabulate
+from drawn_motion import RADIUS, Drive, command, draw, measured, sides, tabulate
 from few import few
 from front import SAMPLES, find_roles
 from rewritten_logs import list_changes, read, write
@@ -154,3 +154,44 @@ def test_an_encoder_that_dies_in_driving_at_one_speed_is_dead_from_then_on(tmp_p
     (span,) = setup.configuration.wheels.ignore
     assert (span.side, span.end_s) == ("right", None)
     assert span.start_s == pytest.approx(144.0, abs=1.0)
+
+
+TURNS = (1.0, 2.0, 3.0, -2.0, -1.0, 2.5)
+PLANS = {
+    "spins, then pivots": [*((-one, one) for one in TURNS), *((one, 0.0) for one in TURNS)],
+    "one wheel, then the other": [*((0.0, one) for one in TURNS), *((one, 0.0) for one in TURNS)],
+    "ahead, then pivots": [*((one, one) for one in TURNS), *((0.0, one) for one in TURNS)],
+}
+
+
+def follow(plan: list[tuple[float, float]], track: float, skids: float) -> tuple[Drive, Reading]:
+    """A drive by what its wheels do for 8 s each [rad/s], whose body turns less than they do."""
+    left, right = np.repeat(np.array(plan), 800, axis=0).T
+    speed, rate = 0.5 * RADIUS * (left + right), RADIUS * (right - left) / track / skids
+    time = 0.01 * np.arange(left.size)
+    rows = np.arange(0, time.size, 10)
+    noise = np.random.default_rng(4).normal(0.0, 0.002, (3, rows.size))
+    yaw = np.cumsum(rate) * 0.01
+    place = np.cumsum(speed * np.exp(1j * yaw)) * 0.01
+    asked = np.column_stack([speed, rate])
+    place, yaw = place[rows] + noise[0] + 1j * noise[1], yaw[rows] + noise[2]
+    wheels = (Held(time[::5], one[::5]) for one in (left, right))
+    return Drive(time, asked, speed, rate, place, yaw, rows), Reading("sides", "wheels", *wheels)
+
+
+@pytest.mark.parametrize("plan", PLANS)
+@pytest.mark.parametrize(("given", "skids"), [(None, 1.0), (0.35, 1.0), (0.35, 1.6)])
+def test_a_wheel_that_stands_in_another_manoeuvre_is_no_dead_encoder(
+    plan: str, given: float | None, skids: float
+) -> None:
+    drive, wheels = follow(PLANS[plan], 0.35, skids)
+    pair = dict(zip(SIDES, (wheels.first, wheels.second), strict=True))
+    assert find_outages(pair, (0.0, 0.0), Reading(), measured(tabulate(drive)), given) == []
+
+
+def test_an_encoder_that_dies_in_pivots_beside_other_drives_is_found() -> None:
+    plan = [*PLANS["one wheel, then the other"], *PLANS["ahead, then pivots"]]
+    drive, wheels = follow(plan, 0.35, 1.0)
+    pair = {"left": wheels.first, "right": kill(wheels.second, "zero", start=150.0)}
+    (one,) = find_outages(pair, (0.0, 0.0), Reading(), measured(tabulate(drive)), 0.35)
+    assert (one.side, one.reads) == ("right", "zero")

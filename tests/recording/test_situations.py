@@ -13,7 +13,8 @@ from few import few
 from written_logs import write_log
 
 from pipeline.analysis import Options
-from pipeline.core import Floats
+from pipeline.core import Floats, SlipError
+from pipeline.recording.inspection import inspect_log
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.readings import Held, Reading
 from pipeline.words import format_finding
@@ -272,3 +273,87 @@ def test_a_wheel_that_steers_and_drives_is_a_tricycle(
     assert setup.sources.wheels is not None
     assert setup.vehicle.wheelbase_m == pytest.approx(wheelbase, rel=0.02)
     assert setup.vehicle.wheel_radius_m == pytest.approx(radius, rel=0.02)
+
+
+@pytest.mark.parametrize("wheels", [2, 4])
+@pytest.mark.parametrize("ratio", [1.5, 1.8])
+def test_circles_of_one_radius_show_no_scale_of_an_encoder(wheels: int, ratio: float, tmp_path: Path) -> None:
+    """Both sides turn in one ratio throughout, which is not that of their encoders."""
+    drive, rng = draw(57), np.random.default_rng(3)
+    left = 2.0 + 1.5 * np.sin(0.4 * drive.time)
+    turns = [left, ratio * left]
+    # The ground takes a share of the turning that varies.
+    taken = np.interp(drive.time, np.arange(0.0, 101.0, 2.0), rng.normal(0.6, 0.03, 51))
+    speed, rate = 0.05 * (1.0 + ratio) * left, 0.1 / 0.5 * (ratio - 1.0) * left * taken
+    yaw = np.cumsum(rate) * STEP
+    place = np.cumsum(speed * np.exp(1j * yaw))[drive.rows] * STEP
+    moved = replace(
+        drive,
+        asked=np.column_stack([speed, rate]),
+        speed=speed,
+        rate=rate,
+        place=place + rng.normal(0.0, 0.002, place.size),
+        yaw=yaw[drive.rows] + rng.normal(0.0, 0.01, place.size),
+    )
+    names = [f"{end}_{side}_wheel" for end in ("front", "rear") for side in ("left", "right")][:wheels]
+    joints = {name: Held(drive.time[::5], one[::5]) for name, one in zip(names, turns * 2, strict=False)}
+    setup = set_up_log(write_log(tmp_path / "log.mcap", moved, joints=joints), Options(out=tmp_path))
+    assert setup.configuration.wheels.factors is None
+    assert "counts" not in " ".join(format_finding(one) for one in setup.choice.findings)
+
+
+def test_a_command_scale_that_turns_contradict_is_told_and_not_applied(tmp_path: Path) -> None:
+    drive = draw(58)
+    speed, rate = 0.78 * drive.speed, 1.05 * drive.rate
+    yaw = np.cumsum(rate) * STEP
+    place = np.cumsum(speed * np.exp(1j * yaw)) * STEP
+    moved = replace(drive, speed=speed, rate=rate, place=place[drive.rows], yaw=yaw[drive.rows])
+    log = write_log(tmp_path / "log.mcap", moved, asked=drive.asked)
+    geometry = {"vehicle": {"kind": "differential", "wheel_radius_m": 0.1, "track_width_m": 0.5}}
+    setup = set_up_log(log, Options(out=tmp_path, overrides=geometry))
+    told = {one.id: format_finding(one) for one in setup.choice.findings}
+    assert "no single scale fits" in told["command_scale"]
+    assert [setup.alignment.command_scale, setup.alignment.command_turn_scale] == [1.0, 1.0]
+
+
+def drive_by_hand(path: Path, left: Floats, right: Floats, gyro: Floats | None) -> Path:
+    """A straight drive, and turns on the spot, of which wheels alone, or a gyro too, are recorded."""
+    time = STEP * np.arange(left.size)
+    none = np.zeros(0)
+    still = np.zeros((left.size, 2))
+    drive = Drive(time, still, none, none if gyro is None else gyro, none, none, np.zeros(0, dtype=np.int64))
+    joints = {name: Held(time[::5], one[::5]) for name, one in (("left_wheel", left), ("right_wheel", right))}
+    return write_log(path, drive, joints=joints, gyro=gyro)
+
+
+@pytest.mark.parametrize(
+    ("radius", "track", "metres", "turns"), [(0.033, 0.16, 2.0, 10.0), (0.12, 0.61, 5.0, 3.0)]
+)
+@pytest.mark.parametrize("counted", [True, False], ids=["counted", "gyro"])
+def test_a_tape_and_turns_tell_radius_and_track(
+    radius: float,
+    track: float,
+    metres: float,
+    turns: float,
+    counted: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    moves = [(0.0, 0.0, 2.0), (metres / radius, metres / radius, 10.0), (0.0, 0.0, 2.0)]
+    spun = np.pi * turns * track / radius
+    moves += [(-spun, spun, 40.0), (0.0, 0.0, 2.0)]
+    left, right = (
+        np.concatenate([np.full(round(one[2] / STEP), one[side] / one[2]) for one in moves])
+        for side in (0, 1)
+    )
+    gyro = None if counted else radius * (right - left) / track
+    log = drive_by_hand(tmp_path / "log.mcap", left, right, gyro)
+    said = f"[truth]\ndistance_m = {metres}\n" + (f"turns = {turns}\n" if counted else "")
+    (tmp_path / "run.toml").write_text(said)
+    (found,) = [one for one in inspect_log(log, Options(out=tmp_path)).notes if one.id == "lengths_by_tape"]
+    for name, length in (("wheel_radius_m", radius), ("track_width_m", track)):
+        value, low, high = found.values[name]
+        assert value == pytest.approx(length, rel=0.01)
+        assert low < length < high
+        assert f"{name} = " in format_finding(found)
+    with pytest.raises(SlipError, match=r"by hand, \[vehicle\] wheel_radius_m = .*; track_width_m = "):
+        set_up_log(log, Options(out=tmp_path))

@@ -422,3 +422,51 @@ def test_topics_of_single_wheels_are_paired_by_short_names(name: str, tmp_path: 
     ]
     setup = set_up(tmp_path, record_twist(robot.asked), *topics, robot.pose())
     assert [signal.topic for signal in setup.sources.wheels.signals] == [name.format(side) for side in sides]
+
+
+LEGS = [f"{leg}_{part}" for leg in ("lf", "rf", "lh_left", "rh_right") for part in ("HAA", "HFE", "KFE")]
+
+
+def record_legs(robot: Robot, kind: str) -> DrawnTopic:
+    """Joints of four legs at 10 Hz: each swings about an angle of its own."""
+    does, count = robot.does, len(LEGS)
+    phase = np.cumsum(1.3 * np.abs(does.speed) + 0.4 * np.abs(does.turn))
+    at = phase[:, None] + np.arange(count)
+    if kind == JOINTS:
+        return robot.joints("/joint_states", LEGS, 0.5 * np.gradient(np.sin(at), does.time, axis=0))
+    messages = [
+        {
+            "joint_names": LEGS,
+            "interface_values": [
+                {"interface_names": ["position"], "values": [float(angle)]} for angle in row
+            ],
+        }
+        for row in 0.3 * np.sin(at) + np.linspace(-1.5, 0.8, count)
+    ]
+    return record_json(does, "/dynamic_joint_states", "control_msgs/msg/DynamicJointState", messages)
+
+
+@pytest.mark.parametrize("kind", [JOINTS, "control_msgs/msg/DynamicJointState"])
+def test_joints_of_legs_are_no_wheels(kind: str, tmp_path: Path) -> None:
+    robot = Robot(seed=73)
+    setup = set_up(tmp_path, robot.command(), record_legs(robot, kind), robot.pose())
+    assert (str(setup.sources.command), setup.sources.wheels) == ("/cmd_vel", None)
+    assert "its joints swing and do not turn round" in told(setup)
+    assert "encoder" not in told(setup)
+    with pytest.raises(SlipError, match=r"command or measured wheels.*joints swing") as caught:
+        set_up(tmp_path, record_legs(robot, kind), robot.pose())
+    assert caught.value.code == "no_command"
+
+
+def test_wheels_that_go_back_and_forth_are_no_legs(tmp_path: Path) -> None:
+    robot = Robot()
+    time = robot.does.time
+    speed = 0.09 * np.cos(1.1 * time)
+    turn = 0.15 * np.cos(0.7 * time)
+    yaw = np.cumsum(turn) * 0.1
+    x, y = (np.cumsum(speed * part) * 0.1 for part in (np.cos(yaw), np.sin(yaw)))
+    robot.does = robot.asked = DrawnDrive(time, speed, turn, x, y, yaw)
+    robot.wheels = np.column_stack([speed - 0.5 * TRACK * turn, speed + 0.5 * TRACK * turn]) / RADIUS
+    assert np.ptp(np.cumsum(robot.wheels, axis=0) * 0.1, axis=0).max() < np.pi
+    setup = set_up(tmp_path, robot.command(), robot.base(), robot.pose())
+    assert str(setup.sources.wheels) == "/joint_states"

@@ -1,0 +1,99 @@
+"""Lengths of a vehicle by a tape and counted turns, for a log that has no other reference."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.core import SlipError
+from pipeline.logs import LogIndex, read_topics
+from pipeline.recording.case import Case
+from pipeline.recording.extract import Extraction, Given
+from pipeline.recording.findings import Finding
+from pipeline.recording.log_choice import make_stand_in
+from pipeline.recording.log_columns import LogColumns
+from pipeline.recording.readings import Held
+from pipeline.recording.topic_values import list_wanted
+from pipeline.sources import Configuration, TruthSection, choose_sources
+
+_TAPE_M, _TAPE = 5e-3, 5e-3
+"""Error of a distance by a tape: 5 mm, or half a percent of it if that is more."""
+_TURNS = 0.1
+"""Error of counted turns: a tenth of one, as a mark on the ground shows."""
+
+
+def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Finding]:
+    """Wheel radius and track by what the wheels turned, or the commands said, over what a tape and turns say.
+
+    Args:
+        index: of the log.
+        configuration: with the section ``[truth]``.
+
+    Returns:
+        One finding, or none where nothing was measured by hand, or nothing turned.
+    """
+    truth = configuration.truth
+    if truth == TruthSection():
+        return []
+    vehicle = make_stand_in(index, configuration)
+    sources = choose_sources(index.channels, configuration, vehicle, where=str(index.path))
+    source = sources.wheels or next(iter(sources.rank_drives("wheels")), None) or sources.command
+    if source is None:
+        return []
+    is_measured = source is not sources.command
+    alone = replace(sources, pose=None, wheels=source if is_measured else None, others={})
+    log = LogColumns(read_topics(index, list_wanted(alone, index.types, [source])))
+    given = Given(log, alone, configuration, vehicle, where=str(index.path))
+    case = Case(given, Extraction(given), alone, None)
+    reading = case.read(source, is_measured=is_measured)
+    first, second = (abs(sum(parts)) for parts in _split(reading.first, reading.second, reading.form))
+    turns, turns_error = truth.turns, _TURNS
+    gyro = case.read_gyro().second
+    if turns is None and gyro.moves:
+        # A gyro counts turns as well as the eye.
+        turns = abs(_integrate(gyro)) / (2.0 * np.pi)
+        turns_error = 0.01 * turns
+    angle = 2.0 * np.pi * (turns or 0.0)
+    values: dict[str, object] = {"source": str(source), "kind": reading.form}
+    if reading.form == "body":
+        if truth.distance_m and first > 0.0:
+            values["ahead"] = _bound(truth.distance_m / first, _share(truth.distance_m))
+        if angle and second > 0.0:
+            values["turning"] = _bound(angle / second, turns_error / (turns or 1.0))
+    elif reading.form == "sides":
+        radius, share = configuration.vehicle.wheel_radius_m, 0.0
+        if truth.distance_m and first > 0.0:
+            radius, share = truth.distance_m / first, _share(truth.distance_m)
+            values["wheel_radius_m"] = _bound(radius, share)
+        if radius and angle and second > 0.0:
+            values["track_width_m"] = _bound(radius * second / angle, share + turns_error / (turns or 1.0))
+    known = {key: one for key, one in values.items() if isinstance(one, list)}
+    values["line"] = "; ".join(f"{key} = {one[0]:.4g}" for key, one in known.items() if key.endswith("_m"))
+    return [Finding("lengths_by_tape", "warning", "vehicle", values)] if known else []
+
+
+def tell_with(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:
+    """The refusal of a log with the lengths that a tape shows all the same."""
+    lines = [one.values["line"] for one in by_tape if one.values["line"]]
+    hint = "".join(f" By what was measured by hand, [vehicle] {line}." for line in lines)
+    return type(error)(error.code, error.what, where=error.where, hint=f"{error.hint}{hint}")
+
+
+def _split(left: Held, right: Held, form: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What adds up to the way ahead, and to the turning, in the signals' own units."""
+    one, other = _integrate(left), _integrate(right)
+    return ((0.5 * one, 0.5 * other), (other, -one)) if form == "sides" else ((one,), (other,))
+
+
+def _integrate(signal: Held) -> float:
+    known = np.isfinite(signal.values)
+    return float(np.trapezoid(signal.values[known], signal.times[known]))
+
+
+def _share(distance_m: float) -> float:
+    return max(_TAPE_M / distance_m, _TAPE)
+
+
+def _bound(value: float, share: float) -> list[float]:
+    """A value with the ends of the interval that a relative error allows."""
+    return [value, value * (1.0 - share), value * (1.0 + share)]
