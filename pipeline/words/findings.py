@@ -853,10 +853,17 @@ def _unit(of: Values) -> str:
 
 
 def _unit_of_wheels(of: Values) -> str:
-    unit = of["unit"] or "no usual unit (ticks, or turns before a gear?)"
+    unit = of["unit"] or "no usual unit"
     text = f"the wheel speeds of {of['source']} are in {unit}"
+    if "rolled_m" in of:
+        text += (
+            f": in rad/s they would be those of wheels with a radius of {of['rolled_m']:.3g} m. They are "
+            f"{of['times']:.3g} times those of wheels of {of['usual_m']} m, as ticks are, or turns of a "
+            "motor before its gear, or of its field by its pole pairs"
+        )
     if "taken_m" in of:
-        text += f": taken as those of wheels of {of['taken_m']} m, which alters no slip"
+        taken = f"taken as those of wheels of {of['taken_m']} m, which alters no slip"
+        text += f"; {taken}" if "rolled_m" in of else f": {taken}"
     return text
 
 
