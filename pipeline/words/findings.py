@@ -867,6 +867,15 @@ def _unit_of_wheels(of: Values) -> str:
     return text
 
 
+def _contradicts_itself(of: Values) -> str:
+    is_pose, step = of["kind"] == "pose", of["step_s"]
+    text = f"the pose of {of['source']} {of['what']} {of['value']:.3g} times as far as its own speeds say"
+    if step is not None:
+        made = "added up without" if is_pose else "changes that are not divided by"
+        text += f", as if these were {made} the time step of {step:.3g} s"
+    return f"{text}; not used: its {of['kind']}"
+
+
 FAULTS: Mapping[str, Template] = {
     **_FAULTS_OF_SIGNS,
     "joint": _joint,
@@ -1087,6 +1096,9 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "no_readable_text": _no_readable_text,
     "vehicle_contradiction": _vehicle_contradiction,
     "numbers_not_used": "not used: {what}",
+    "odometry_contradicts_itself": {"pose": _contradicts_itself, "speeds": _contradicts_itself},
+    "pose_contradicts_itself": "the pose of {source} is wrong, and nothing else shows the motion: no other "
+    "pose is recorded, nor wheels that follow the command",
     "pose_of_another": "{pose} is taken for the pose, and not {other}: the vehicle moves as it does; the "
     "other is of another body",
     "topic_left_out": "{where} is left out: {why}",
