@@ -120,9 +120,7 @@ def _find_driven_unit(case: Case) -> None:
     explained = command.reading.explained
     is_open = wheels.reading.form == "sides" and not case.is_known and command.reading.form != "sides"
     if is_open and command.sign("ahead"):
-        turn = 1.0 / abs(float(explained.turned.gains[0])) if command.sign("turned") else None
-        gain = 1.0 / abs(float(explained.ahead.gains[0]))
-        correct_wheel_unit(case, wheels, gain, explained.shares[0], turn=turn)
+        correct_wheel_unit(case, wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
 
 
 def _find_body_units(case: Case) -> bool:
