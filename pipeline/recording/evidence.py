@@ -417,6 +417,12 @@ def can_roll(gain: float, share: float, turn: float | None = None) -> bool:
     return is_round and (turn is None or abs(turn) < _WIDEST)
 
 
+def name_wheel_units(name: str) -> set[str]:
+    """Units of wheel speeds that the name of a signal says."""
+    words = {"rpm": "rpm", "deg/s": "deg", "mm/s": "mm_?p?_?s", "cm/s": "cm_?p?_?s"}
+    return {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
+
+
 def find_wheel_unit(
     gain: float, share: float, name: str, radius: float | None = None, turn: float | None = None
 ) -> str:
@@ -429,8 +435,7 @@ def find_wheel_unit(
         radius: of the wheels, if it is known; else about .12 m within a factor of two.
         turn: as that of `can_roll`.
     """
-    words = {"rpm": "rpm", "deg/s": "deg", "mm/s": "mm_?p?_?s", "cm/s": "cm_?p?_?s"}
-    named = {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
+    named = name_wheel_units(name)
     spread = 0.7 if radius is None else 0.35
 
     def rate(factor: float, middle: float, spread: float) -> float:

@@ -18,6 +18,7 @@ from pipeline.recording.evidence import (
     find_steering_unit,
     find_wheel_unit,
     is_unit_exact,
+    name_wheel_units,
 )
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import measure_motion
@@ -254,7 +255,7 @@ def correct_wheel_unit(
         return
     unit = find_wheel_unit(gain, share, str(wheels.source), radius, turn)
     values: dict[str, object] = {"source": str(wheels.source), "unit": unit}
-    if radius is None and unit not in RIMS:
+    if radius is None and unit not in {*RIMS, *name_wheel_units(str(wheels.source))}:
         values |= {"rolled_m": abs(gain), "times": TAKEN_M / abs(gain), "usual_m": TAKEN_M}
     if radius is None and (not unit or unit in RIMS):
         values["taken_m"] = TAKEN_M
