@@ -76,6 +76,7 @@ FAULTS = (
     "command_of_map",
     "commands_mixed",
     "not_driven",
+    "pose_contradicts_itself",
     "motor_reversed",
     "wheels_reversed",
     "wheel_dead",

@@ -136,6 +136,7 @@ class Case:
         is_judged: whether a side of the wheels is dead or reversed, which explains all signs.
         geometry: lengths by the signals.
         alignment: corrections of the command; None where nothing shows them.
+        refused: why the poses say nothing; None if they may.
     """
 
     given: Given
@@ -158,6 +159,7 @@ class Case:
     is_judged: bool = False
     geometry: Geometry = field(default_factory=Geometry)
     alignment: Alignment | None = None
+    refused: Finding | None = None
 
     @property
     def is_known(self) -> bool:

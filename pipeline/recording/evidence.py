@@ -395,9 +395,37 @@ _UNUSUAL = 4.0
 """Surprise of counts that no unit explains, as ticks of an encoder are [nats]."""
 _ANY = 10.0
 """Range of the logarithm of what such a count may be."""
+_RADII_M = (0.02, 1.0)
+"""Radii [m] that wheels of vehicles have."""
+_WIDEST = 0.5
+"""Radius of a wheel over the track, below which it is: wheels of both sides do not meet."""
+_OF_KNOWN = 0.25
+"""Largest absolute logarithm of a known radius over that of a unit which is not named: more is a gear."""
 
 
-def find_wheel_unit(gain: float, share: float, name: str, radius: float | None = None) -> str:
+def can_roll(gain: float, share: float, turn: float | None = None) -> bool:
+    """Whether wheels in rad/s roll so: their radius is one that vehicles have, and below half the track.
+
+    Args:
+        gain: path over the wheels' angle.
+        share: part of the motion that is explained; a poor fit attenuates the gain.
+        turn: change of heading over the difference of both sides' angles, which is the radius over the track;
+            None if nothing tells.
+    """
+    size = abs(gain)
+    is_round = _shrink(float(np.log(size / _RADII_M[0])), share) >= 0.0 and size <= _RADII_M[1]
+    return is_round and (turn is None or abs(turn) < _WIDEST)
+
+
+def name_wheel_units(name: str) -> set[str]:
+    """Units of wheel speeds that the name of a signal says."""
+    words = {"rpm": "rpm", "deg/s": "deg", "mm/s": "mm_?p?_?s", "cm/s": "cm_?p?_?s"}
+    return {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
+
+
+def find_wheel_unit(
+    gain: float, share: float, name: str, radius: float | None = None, turn: float | None = None
+) -> str:
     """Unit of wheel speeds by the radius that each would mean; empty if it is none, as ticks are.
 
     Args:
@@ -405,9 +433,9 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
         share: part of the motion that is explained; a poor fit attenuates the gain.
         name: of the signals; a unit that it names is no surprise, and "rad/s" is one then.
         radius: of the wheels, if it is known; else about .12 m within a factor of two.
+        turn: as that of `can_roll`.
     """
-    words = {"rpm": "rpm", "deg/s": "deg", "mm/s": "mm_?p?_?s", "cm/s": "cm_?p?_?s"}
-    named = {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
+    named = name_wheel_units(name)
     spread = 0.7 if radius is None else 0.35
 
     def rate(factor: float, middle: float, spread: float) -> float:
@@ -428,7 +456,12 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
     costs = {unit: cost + _NAMED * bool(unit and named - {unit}) for unit, cost in costs.items()}
     best = min(costs, key=lambda unit: costs[unit])
     least = _CLEAR if best in RIMS else _WIN
-    return best if best in named or costs["rad/s"] - costs[best] > least else "rad/s"
+    if best not in named and costs["rad/s"] - costs[best] <= least:
+        best = "rad/s"
+    if radius is None:
+        return "" if best == "rad/s" and not can_roll(gain, share, turn) else best
+    is_near = best in RIMS or abs(np.log(abs(gain) / WHEELS[best] / radius)) < _OF_KNOWN
+    return best if best in named or is_near else "rad/s"
 
 
 # Roles.

@@ -15,6 +15,7 @@ from pipeline.recording.legs import ask_legs, ask_motion
 from pipeline.recording.lengths import ask_lengths
 from pipeline.recording.losses import ask_losses
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS
+from pipeline.recording.odometry import ask_odometry
 from pipeline.recording.outages import ask_outages
 from pipeline.recording.publishers import ask_publishers
 from pipeline.recording.readings import Reading
@@ -77,6 +78,7 @@ class Recording:
         evidence: on every signal that was tried.
         alignment: corrections of the command; None where nothing shows them.
         is_still: whether the body hardly moves where the drive does.
+        refused: why the poses say nothing, and nothing else was asked; None if they may.
     """
 
     sources: Sources
@@ -87,6 +89,7 @@ class Recording:
     evidence: tuple[Evidence, ...] = ()
     alignment: Alignment | None = None
     is_still: bool = False
+    refused: Finding | None = None
 
     @property
     def is_followed(self) -> bool:
@@ -107,6 +110,7 @@ def ask_driven(case: Case) -> Case:
 
 QUESTIONS: tuple[Callable[[Case], Case], ...] = (
     # What there is, and in which frame and of whom the motion is.
+    ask_odometry,
     ask_motion,
     ask_legs,
     ask_gyro,
@@ -157,7 +161,9 @@ def examine(given: Given) -> Recording:
             return _take_by_name(case, as_given)
         for ask in QUESTIONS:
             case = ask(case)
-            if not case.motion.is_known:
+            if case.refused is not None:
+                return replace(as_given, refused=case.refused)
+            if ask is not ask_odometry and not case.motion.is_known:
                 return as_given
     except SlipError:
         if given.sources.pose is None:

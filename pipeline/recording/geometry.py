@@ -10,9 +10,9 @@ from itertools import islice
 
 import numpy as np
 
-from pipeline.core import NORMAL_95, join_parts
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Fit, Motion, Steps
-from pipeline.recording.readings import SIDES, UNEXPLAINED, Explained, Reading
+from pipeline.core import NORMAL_95, fit_robustly, join_parts
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Fit, Motion, Steps, fit
+from pipeline.recording.readings import DELAYS_S, SIDES, UNEXPLAINED, Explained, Reading
 from pipeline.sources import RANGES, find_alike_vehicles
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
@@ -147,6 +147,64 @@ def explain_wheels(command: Reading, wheels: Reading) -> Explained:
         return UNEXPLAINED
     made = Reading(command.form, command.name, command.first, command.second).explain(roll_wheels(wheels))
     return UNEXPLAINED if not made.is_sure or made.crossed else made
+
+
+_SLOW = 0.5
+"""Demand over the largest one up to which wheels are taken to follow at first."""
+_OVER = 1.05
+"""Demand over the fastest that wheels turn from which on they do not follow."""
+_LIMITED = 0.02
+"""Share of a drive beyond which wheels that do not follow are at a limit, and no noise."""
+_SAME_SIDES = 1.02
+"""Ratio of the gains of both sides up to which they are the same."""
+_AFTER_S = 1.0
+"""Time [s] after such a demand in which the wheels still come from their limit."""
+
+
+def explain_followed(reading: Reading, made: Explained) -> Explained:
+    """What wheels do of a command where they follow it: neither at a limit nor just after.
+
+    Args:
+        reading: a body command.
+        made: what both sides of the wheels do of it.
+
+    Returns:
+        The fit to a part of the motion; that to all of it if there is no limit.
+    """
+    steps = made.motion.steps
+    elapsed = (steps.end - steps.start)[:, None]
+    columns = np.column_stack(reading.columns(steps, made.lag, made.delay, crossed=False)) / elapsed
+    ahead, half = made.motion.body.real, 0.5 * made.motion.yaw
+    sides = np.column_stack([ahead - half, ahead + half]) / elapsed
+    top = np.quantile(np.abs(sides), 0.99, axis=0)
+    gains = np.linalg.lstsq(columns, sides, rcond=None)[0]
+    asked = np.abs(columns @ gains).max(axis=1)
+    followed, limited = asked < _SLOW * float(np.quantile(asked, 0.95)), asked > np.inf
+    for _ in range(3):
+        if followed.sum() < FEWEST_STEPS:
+            return made
+        gains = np.column_stack([fit_robustly(columns[followed], side[followed])[0] for side in sides.T])
+        limited = (np.abs(columns @ gains) > _OVER * top).any(axis=1)
+        last = np.maximum.accumulate(np.where(limited, steps.end, -np.inf))
+        followed = steps.start > last + _AFTER_S
+    if limited.mean() < _LIMITED or followed.sum() < FEWEST_STEPS:
+        return made
+    return reading.fit_to(made.motion.take(followed), DELAYS_S, crossed=False)
+
+
+def find_track_of_sides(reading: Reading, made: Explained) -> float | None:
+    """Track by which each side follows the turning of a command, in its unit; None if both follow alike.
+
+    Sides that follow a command ahead by different gains show no radius, and the mean of them no track.
+    """
+    steps = made.motion.steps
+    columns = np.column_stack(reading.columns(steps, made.lag, made.delay, crossed=False))
+    ahead, half = made.motion.body.real, 0.5 * made.motion.yaw
+    left, right = (fit(side, columns, steps) for side in (ahead - half, ahead + half))
+    error = float(np.hypot(1.0 / left.t[0], 1.0 / right.t[0]))
+    apart = abs(float(np.log(left.gains[0] / right.gains[0])))
+    tracks = [2.0 * abs(float(one.gains[1] / one.gains[0])) for one in (left, right)]
+    return 0.5 * sum(tracks) if apart > np.log(_SAME_SIDES) + CLEAR * error else None
 
 
 def measure_controller(made: Explained) -> tuple[Length | None, Length | None]:

@@ -9,6 +9,8 @@ from pipeline.recording.evidence import RIMS
 from pipeline.recording.geometry import (
     Geometry,
     Length,
+    explain_followed,
+    find_track_of_sides,
     list_errors,
     measure_car,
     measure_controller,
@@ -32,6 +34,8 @@ def _measure_driven(case: Case) -> Geometry:
     explained = command.reading.explained
     if not command.is_sure or form == "body" or command.reading.form == "sides":
         return Geometry()
+    if form == "sides" and command.reading.form == "body" and not is_crossed(command):
+        explained = explain_followed(command.reading, explained)
     fits = {"ahead": explained.ahead, "turned": explained.turned}
     gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
     errors = dict(zip(fits, list_errors(explained), strict=True))
@@ -61,9 +65,14 @@ def _measure_lengths(case: Case) -> Geometry:
     made = Geometry()
     sides = wheels if wheels.reading.form == "sides" else command
     if sides is wheels and command.reading.form == "body" and case.is_scaled and case.driven.is_known:
-        radius, track = measure_controller(case.driven)
+        driven = explain_followed(command.reading, case.driven)
+        radius, track = measure_controller(driven)
         speed, rate = case.command_factors()
-        radius = None if case.in_bursts else _scale(radius, speed * case.wheel_factor())
+        apart = None if radius is None else find_track_of_sides(command.reading, driven)
+        if track is not None and apart is not None:
+            track = replace(track, value=apart)
+        is_open = case.in_bursts or apart is not None
+        radius = None if is_open else _scale(radius, speed * case.wheel_factor())
         made = Geometry(radius=radius, track=_scale(track, speed / rate))
     if sides.reading.form == "sides" and sides.is_sure and not is_crossed(sides):
         factor = case.wheel_factor("wheels" if sides is wheels else "command")

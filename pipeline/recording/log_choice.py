@@ -565,6 +565,9 @@ def _compare(chosen: Choice, given: Given) -> Choice:
             where = "pose" if best.same_as else str(best.source)
             findings.append(Finding("pose_from_wheels", "error", where, why))
     recording = examine(replace(given, sources=sources))
+    if recording.refused is not None:
+        whole = replace(chosen, ratings=ratings, log=given.log, recording=recording)
+        return _do_without_pose(whole, replace(given, sources=sources), recording.refused)
     for other in _list_equals(ratings) if not recording.is_followed or _is_astray(ratings) else ():
         instead = replace_pose(chosen.sources, [other, *(one for one in ratings if one is not other)])
         made = examine(replace(given, sources=instead))
@@ -582,6 +585,22 @@ def _compare(chosen: Choice, given: Given) -> Choice:
         log=given.log,
         recording=recording,
     )
+
+
+def _do_without_pose(chosen: Choice, given: Given, refused: Finding) -> Choice:
+    """The choice without a pose that was refused: with the next one, or the wheels in its stead."""
+    from pipeline.recording.pose_choice import replace_pose  # noqa: PLC0415 - heavy
+
+    rest = [one for one in chosen.ratings[1:] if not (one.refusal or one.from_wheels)]
+    told = replace(chosen, findings=(*chosen.findings, refused))
+    if rest:
+        return _compare(told, replace(given, sources=replace_pose(given.sources, rest)))
+    bare = replace(given.sources, pose=None)
+    alone = _let_wheels_stand_in(replace(told, sources=bare, recording=None), replace(given, sources=bare))
+    if alone.recording is not None:
+        return alone
+    error = Finding("pose_contradicts_itself", "error", "pose", {"source": refused.values["source"]})
+    return replace(told, findings=(*told.findings, error))
 
 
 _STEADY = 5.0

@@ -161,9 +161,10 @@ def ask_roles(case: Case) -> Case:
     rivals = [
         one for one in sure if not one.is_measured or (is_followed and one.source.form is DriveForm.SIDES)
     ]
-    if rivals and command.source.reason != CONFIGURED:
-        rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in rivals}
-        best = max(rivals, key=lambda one: rates[id(one)])
+    likely = _leave_out_others(rivals)
+    if likely and command.source.reason != CONFIGURED:
+        rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in likely}
+        best = max(likely, key=lambda one: rates[id(one)])
         if not command.is_there or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
             if command.is_there:
                 _report_command(case, best, command)
@@ -193,6 +194,21 @@ def ask_roles(case: Case) -> Case:
         if command.reading.form == "sides" and not is_named_measured(wheels.reading.name):
             wheels = NO_CANDIDATE
     return replace(case, command=command, wheels=wheels)
+
+
+def _leave_out_others(rivals: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates for the command that the motion follows as another one, both ahead and in turning.
+
+    Any command of a vehicle that drives ahead explains a part of that, by its mean.
+    """
+    kept = list(rivals)
+    for index, axis in enumerate(("ahead", "turned")):
+        shares = {id(one): one.reading.explained.shares[index] for one in rivals}
+        shown = [
+            shares[id(one)] for one in rivals if not one.is_measured and one.reading.explained.sign(axis)
+        ]
+        kept = [one for one in kept if shares[id(one)] >= _UNLIKE * max(shown, default=0.0)]
+    return kept
 
 
 _HELD = 0.5

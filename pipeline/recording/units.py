@@ -18,6 +18,7 @@ from pipeline.recording.evidence import (
     find_steering_unit,
     find_wheel_unit,
     is_unit_exact,
+    name_wheel_units,
 )
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import measure_motion
@@ -162,7 +163,8 @@ def _find_side_unit(case: Case) -> None:
         explained = command.reading.explained
         radius = case.vehicle.wheel_radius_m if case.is_known else None
         gain = float(explained.ahead.gains[0])
-        correct_wheel_unit(case, command, gain, explained.shares[0], radius, "command")
+        turn = float(explained.turned.gains[0]) if command.sign("turned") else None
+        correct_wheel_unit(case, command, gain, explained.shares[0], radius, turn, "command")
 
 
 def _find_speed_units(case: Case) -> list[bool]:
@@ -225,7 +227,7 @@ def _report_units(
 def _find_wheel_unit(case: Case) -> None:
     """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
     command, wheels = case.command, case.wheels
-    explained, share = wheels.reading.explained, 1.0
+    explained, share, turn = wheels.reading.explained, 1.0, None
     radius, driven = case.vehicle.wheel_radius_m if case.is_known else None, case.driven
     if radius is not None and driven.sign("ahead") > 0:
         # Wheels follow a command closely on any ground.
@@ -233,9 +235,10 @@ def _find_wheel_unit(case: Case) -> None:
         gain = of_command / float(driven.ahead.gains[0])
     elif wheels.sign("ahead"):
         gain, share = float(explained.ahead.gains[0]), explained.shares[0]
+        turn = float(explained.turned.gains[0]) if wheels.sign("turned") else None
     else:
         return
-    correct_wheel_unit(case, wheels, gain, share, radius)
+    correct_wheel_unit(case, wheels, gain, share, radius, turn)
 
 
 def correct_wheel_unit(
@@ -244,13 +247,16 @@ def correct_wheel_unit(
     gain: float,
     share: float,
     radius: float | None = None,
+    turn: float | None = None,
     role: str = "wheels",
 ) -> None:
     """Correct the unit of wheel speeds, unless the type or the user gives it; see `find_wheel_unit`."""
     if wheels.source.signals[0].unit or getattr(case.configuration, role).unit is not None:
         return
-    unit = find_wheel_unit(gain, share, str(wheels.source), radius)
+    unit = find_wheel_unit(gain, share, str(wheels.source), radius, turn)
     values: dict[str, object] = {"source": str(wheels.source), "unit": unit}
+    if radius is None and unit not in {*RIMS, *name_wheel_units(str(wheels.source))}:
+        values |= {"rolled_m": abs(gain), "times": TAKEN_M / abs(gain), "usual_m": TAKEN_M}
     if radius is None and (not unit or unit in RIMS):
         values["taken_m"] = TAKEN_M
     if not unit:

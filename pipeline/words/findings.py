@@ -870,11 +870,27 @@ def _unit(of: Values) -> str:
 
 
 def _unit_of_wheels(of: Values) -> str:
-    unit = of["unit"] or "no usual unit (ticks, or turns before a gear?)"
+    unit = of["unit"] or "no usual unit"
     text = f"the wheel speeds of {of['source']} are in {unit}"
+    if "rolled_m" in of:
+        text += (
+            f": in rad/s they would be those of wheels with a radius of {of['rolled_m']:.3g} m. They are "
+            f"{of['times']:.3g} times those of wheels of {of['usual_m']} m, as ticks are, or turns of a "
+            "motor before its gear, or of its field by its pole pairs"
+        )
     if "taken_m" in of:
-        text += f": taken as those of wheels of {of['taken_m']} m, which alters no slip"
+        taken = f"taken as those of wheels of {of['taken_m']} m, which alters no slip"
+        text += f"; {taken}" if "rolled_m" in of else f": {taken}"
     return text
+
+
+def _contradicts_itself(of: Values) -> str:
+    is_pose, step = of["kind"] == "pose", of["step_s"]
+    text = f"the pose of {of['source']} {of['what']} {of['value']:.3g} times as far as its own speeds say"
+    if step is not None:
+        made = "added up without" if is_pose else "changes that are not divided by"
+        text += f", as if these were {made} the time step of {step:.3g} s"
+    return f"{text}; not used: its {of['kind']}"
 
 
 FAULTS: Mapping[str, Template] = {
@@ -1101,6 +1117,9 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "no_readable_text": _no_readable_text,
     "vehicle_contradiction": _vehicle_contradiction,
     "numbers_not_used": "not used: {what}",
+    "odometry_contradicts_itself": {"pose": _contradicts_itself, "speeds": _contradicts_itself},
+    "pose_contradicts_itself": "the pose of {source} is wrong, and nothing else shows the motion: no other "
+    "pose is recorded, nor wheels that follow the command",
     "pose_of_another": "{pose} is taken for the pose, and not {other}: the vehicle moves as it does; the "
     "other is of another body",
     "topic_left_out": "{where} is left out: {why}",

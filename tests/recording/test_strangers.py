@@ -1,5 +1,6 @@
 """Logs of strangers: what is not the vehicle's is told from what is, nothing is left out in silence."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -196,6 +197,39 @@ def test_wheel_speeds_of_rims_are_in_the_unit_of_their_name(unit: str, factor: f
     setup = set_up(tmp_path, robot.command(), *speeds, robot.pose())
     assert setup.configuration.wheels.unit == unit
     assert setup.vehicle.track_width_m == pytest.approx(TRACK, rel=0.03)
+
+
+@pytest.mark.parametrize("times", [7.0, 30.0, 0.02], ids=["pole pairs", "a gear", "turns of ten"])
+@pytest.mark.parametrize("form", ["joints", "numbers"])
+def test_wheels_of_a_radius_that_no_vehicle_has_are_on_another_scale(
+    form: str, times: float, tmp_path: Path
+) -> None:
+    robot = Robot()
+    rates = times * robot.wheels
+    wheels = [robot.joints("/joint_states", ["left_wheel_joint", "right_wheel_joint"], rates)]
+    if form == "numbers":
+        names = ("/left_wheel/velocity", "/right_wheel/velocity")
+        wheels = [robot.number(name, rate) for name, rate in zip(names, rates.T, strict=True)]
+    setup = set_up(tmp_path, robot.command(), *wheels, robot.pose())
+    radius = setup.vehicle.wheel_radius_m
+    assert 0.02 < radius < 0.5 * setup.vehicle.track_width_m
+    assert re.search(r"[\d.]+ times those of wheels of 0.1 m, as ticks are", told(setup))
+    wheels_as = setup.configuration.wheels
+    # Wheels before a gear of 30 may as well be in degrees: both are said.
+    as_scale = None if wheels_as.unit == "deg/s" else pytest.approx(1.0 / times, rel=0.03)
+    assert wheels_as.scale == as_scale
+
+
+@pytest.mark.parametrize("times", [7.0, 15.0])
+def test_a_gear_of_a_known_vehicle_is_no_unit(times: float, tmp_path: Path) -> None:
+    robot = Robot()
+    wheels = robot.joints("/joint_states", ["left_wheel_joint", "right_wheel_joint"], times * robot.wheels)
+    given = {"vehicle": {"kind": "differential", "wheel_radius_m": RADIUS, "track_width_m": TRACK}}
+    log = write_drawn(tmp_path / "log.mcap", robot.command(), wheels, robot.pose())
+    setup = set_up_log(log, Options(out=tmp_path, overrides=given))
+    assert setup.configuration.wheels.unit is None
+    found = next(one for one in setup.choice.findings if one.id == "wheels_scaled")
+    assert found.value == pytest.approx(times, rel=0.03)
 
 
 def test_an_odometry_whose_pose_is_not_filled_shows_the_drive(tmp_path: Path) -> None:

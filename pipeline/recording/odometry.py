@@ -1,0 +1,109 @@
+"""A message of odometry compared with itself: its pose moves as far as its own speeds say.
+
+It is asked before units, clocks and roles: what a message contradicts by itself is of no other topic.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.core import Floats, rigid
+from pipeline.recording.case import Case
+from pipeline.recording.evidence import RATES, SPEEDS
+from pipeline.recording.findings import Finding
+from pipeline.recording.motion import FEWEST_STEPS, measure_share
+from pipeline.recording.readings import Held, Reading
+from pipeline.run import LIVE_SHARE
+from pipeline.sources import LENGTH_UNITS, DriveForm, PoseContent
+
+_APART = 4.0
+"""Ratio of pose and speeds from which on one of them is wrong: skidding wheels turn a body a quarter as far
+as they say at least."""
+_CONSTANT = 0.9
+"""Least share of the pose's motion that a factor in its computation explains."""
+_ALIKE = 0.1
+"""Largest absolute logarithm of two ratios that are the same: of a unit, or of the time step."""
+
+
+def ask_odometry(case: Case) -> Case:
+    """Refuse a pose that contradicts the speeds of its own messages, or leave these out.
+
+    Either a pose adds up speeds without the time step, or speeds are changes that are not divided by it: a
+    command tells which of them is wrong, without one the usual speed of a vehicle, a metre or radian a
+    second.
+    """
+    pose = case.sources.pose
+    of_pose = [
+        one for one in case.sources.rank_drives("wheels") if pose and one.signals[0].topic == pose.topic
+    ]
+    source = next((one for one in of_pose if one.form is DriveForm.BODY), None)
+    if pose is None or source is None or pose.content is not PoseContent.POSE:
+        return case
+    twist = case.read(source, is_measured=True)
+    times, moved, turned = _list_changes(case)
+    if times.size < FEWEST_STEPS:
+        return case
+    ratios = [_find_ratio(*each) for each in ((times, moved, twist.first), (times, turned, twist.second))]
+    units = ([*SPEEDS.values(), *(1.0 / one for one in LENGTH_UNITS.values())], [*RATES.values()])
+    wrong = [
+        ratio is not None
+        and abs(np.log(ratio)) > np.log(_APART)
+        and not any(_is_near(ratio, one) for one in of)
+        for ratio, of in zip(ratios, units, strict=True)
+    ]
+    if not any(wrong):
+        return case
+    axis = 1 if wrong[1] else 0
+    is_pose = _is_pose_wrong(case, axis, ratios[axis] or 1.0, (twist.first, twist.second)[axis])
+    step_s = float(np.median(np.diff(times)))
+    is_step = _is_near(ratios[axis] or 1.0, 1.0 / step_s)
+    values = {
+        "kind": "pose" if is_pose else "speeds",
+        "value": ratios[axis],
+        "what": ("moves", "turns")[axis],
+        "source": pose.topic,
+        "step_s": step_s if is_step else None,
+    }
+    finding = Finding("odometry_contradicts_itself", "warning", "pose", values)
+    if is_pose:
+        return replace(case, refused=finding)
+    case.findings.append(finding)
+    return case.leave_out(source)
+
+
+def _list_changes(case: Case) -> tuple[Floats, Floats, Floats]:
+    """Times of messages [s], and how far the pose moves [m] and turns [rad] up to each, shape (n,) each."""
+    poses = case.extraction.poses()
+    times = poses["t"].to_numpy()
+    quaternion = poses.select("q_x", "q_y", "q_z", "q_w").to_numpy()
+    turned = rigid.wrap_angle(np.diff(rigid.euler_from_quaternions(quaternion)[2]))
+    moved = np.hypot(*(np.diff(poses[axis].to_numpy()) for axis in "xy"))
+    known = np.isfinite(moved) & np.isfinite(turned) & (np.diff(times) > 0.0)
+    return times[1:][known], moved[known], np.abs(turned[known])
+
+
+def _find_ratio(times: Floats, changed: Floats, speed: Held) -> float | None:
+    """How far a pose changes over how far speeds say it does, if that is a constant; else None."""
+    if not speed.moves or times[-1] <= times[0]:
+        return None
+    said = np.abs(np.interp(times, speed.times, speed.values)) * np.diff(times, prepend=times[0])
+    live = said > LIVE_SHARE * float(np.quantile(said, 0.95))
+    if live.sum() < FEWEST_STEPS:
+        return None
+    ratio = float(np.median(changed[live] / said[live]))
+    return ratio if ratio > 0.0 and measure_share(changed, ratio * said) > _CONSTANT else None
+
+
+def _is_near(ratio: float, other: float) -> bool:
+    return abs(float(np.log(ratio / other))) < _ALIKE
+
+
+def _is_pose_wrong(case: Case, axis: int, ratio: float, said: Held) -> bool:
+    """Whether the pose is, and not the speeds of its messages."""
+    source, asked = case.sources.command, Reading()
+    if source is not None and source.form is DriveForm.BODY:
+        asked = case.read(source, is_measured=False)
+    command = (asked.first, asked.second)[axis]
+    usual = float(np.abs(command.grid).mean()) if command.moves else 1.0
+    of_usual = float(np.abs(said.grid).mean()) / usual
+    return bool(abs(np.log(of_usual * ratio)) > abs(np.log(of_usual)))

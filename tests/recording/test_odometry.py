@@ -1,0 +1,101 @@
+"""Messages of odometry whose pose contradicts their own speeds."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drawn_drives import DrawnDrive, DrawnTopic, draw_drive, record_cdr, record_twist, stamp_ros, write_drawn
+
+from pipeline.analysis import Options
+from pipeline.core import Floats
+from pipeline.recording.log_setup import LogSetup, set_up_log
+from pipeline.words import format_finding
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def set_up(tmp_path: Path, *topics: DrawnTopic) -> LogSetup:
+    return set_up_log(write_drawn(tmp_path / "log.mcap", *topics), Options(out=tmp_path))
+
+
+def told(setup: LogSetup) -> str:
+    return " ".join(format_finding(one) for one in setup.choice.findings)
+
+
+def follow(values: Floats, share: float = 0.4) -> Floats:
+    made = np.zeros(values.size)
+    for row in range(1, values.size):
+        made[row] = made[row - 1] + share * (values[row - 1] - made[row - 1])
+    return made
+
+
+def record_odometry(
+    drive: DrawnDrive, topic: str, frame: str, *, pose: float = 1.0, speeds: float = 1.0, every: int = 1
+) -> DrawnTopic:
+    """Odometry of a base that follows late, its pose and its speeds with factors."""
+    speed, turn = follow(drive.speed), follow(drive.turn)
+    step = drive.time[1] * pose
+    yaw = np.cumsum(turn) * step
+    place = np.cumsum(speed * np.exp(1j * yaw)) * step
+    fields: Mapping[str, Any] = {
+        **stamp_ros(drive),
+        "header.frame_id": frame,
+        "child_frame_id": "base_link",
+        "pose.pose.position.x": place.real,
+        "pose.pose.position.y": place.imag,
+        "pose.pose.orientation.z": np.sin(0.5 * yaw),
+        "pose.pose.orientation.w": np.cos(0.5 * yaw),
+        "twist.twist.linear.x": speeds * speed,
+        "twist.twist.angular.z": speeds * turn,
+    }
+    return record_cdr(drive, topic, ODOMETRY, fields, rows=drive.rows()[::every])
+
+
+@pytest.mark.parametrize(("topic", "frame"), [("/odom", "odom"), ("/wheel/odometry", "map")])
+def test_a_pose_that_is_added_up_without_the_time_step_is_refused(
+    topic: str, frame: str, tmp_path: Path
+) -> None:
+    drive = draw_drive(60.0)
+    step = float(drive.time[1])
+    setup = set_up(tmp_path, record_twist(drive), record_odometry(drive, topic, frame, pose=1.0 / step))
+    text = told(setup)
+    assert f"the pose of {topic} turns {1.0 / step:.3g} times as far as its own speeds say" in text
+    assert f"without the time step of {step:.3g} s" in text
+    assert setup.sources.pose is not None
+    assert setup.sources.pose.wheels is not None
+    assert not {"command_corrected", "pose_turned", "command_scale"} & {
+        one.id for one in setup.choice.findings
+    }
+
+
+def test_another_pose_is_taken_for_one_that_contradicts_itself(tmp_path: Path) -> None:
+    drive = draw_drive(60.0)
+    noise = np.random.default_rng(2).normal(0.0, 0.01, (2, drive.x.size))
+    noisy = replace(drive, x=drive.x + noise[0], y=drive.y + noise[1])
+    fields = stamp_ros(drive) | noisy.pose("pose.") | {"header.frame_id": "map"}
+    beside = record_cdr(drive, "/other/pose", "geometry_msgs/msg/PoseStamped", fields)
+    wrong = record_odometry(drive, "/wheel/odometry", "map", pose=8.0)
+    setup = set_up(tmp_path, record_twist(drive), wrong, beside)
+    assert str(setup.sources.pose) == "/other/pose"
+
+
+@pytest.mark.parametrize("has_command", [True, False])
+def test_speeds_that_are_changes_of_a_message_are_left_out(*, has_command: bool, tmp_path: Path) -> None:
+    drive = draw_drive(60.0)
+    step = float(drive.time[1])
+    odometry = record_odometry(drive, "/wheel/odometry", "map", speeds=step)
+    command = record_twist(drive) if has_command else record_twist(drive, "/other/twist")
+    setup = set_up(tmp_path, command, odometry)
+    assert f"not divided by the time step of {step:.3g} s; not used: its speeds" in told(setup)
+    assert str(setup.sources.pose) == "/wheel/odometry"
+    assert setup.sources.wheels is None
+
+
+@pytest.mark.parametrize(("pose", "speeds"), [(1.0, 1.0), (1.0, 0.7), (0.6, 1.0)])
+def test_a_base_that_skids_contradicts_nothing(pose: float, speeds: float, tmp_path: Path) -> None:
+    drive = draw_drive(60.0)
+    odometry = record_odometry(drive, "/wheel/odometry", "map", pose=pose, speeds=speeds)
+    assert "its own speeds say" not in told(set_up(tmp_path, record_twist(drive), odometry))
