@@ -305,7 +305,7 @@ def _change(
     if must_help and refusals:
         if not (spoken.json or spoken.quiet):
             # What it would have made of the errors is shown all the same.
-            print_lines(words.format_change(changed.fit, refusals))
+            print_lines(words.format_change(changed.fit, refusals, is_made=False))
         hint = "Add the others without it" if len(refusals) < len(changed.added) else "Choose another effect"
         what = f"{words.format_refusals(refusals)}: the model is unchanged"
         raise SlipError("no_help", what, where=str(path), hint=f"{hint}, or give --anyway")

@@ -218,12 +218,13 @@ def format_refusals(refusals: Mapping[str, str]) -> str:
     return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
 
 
-def format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
+def format_change(fit: ModelFit, refusals: Mapping[str, str], *, is_made: bool = True) -> list[str]:
     """The ladders of a model before and after a change, and its parameters.
 
     Args:
         fit: the model on runs.
         refusals: reasons against added effects, by id.
+        is_made: whether the change is made in spite of them: else only the ladders are shown.
     """
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.data.names)
@@ -232,6 +233,8 @@ def format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     if old is not new:
         lines += ["", "before", *format_ladder(old.ladder, fit.floor), "", "after"]
     lines += format_ladder(new.ladder, fit.floor)
+    if not is_made:
+        return [*lines, ""]
     if old is not new:
         lines += describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
     if chosen.warning:

@@ -199,8 +199,10 @@ def test_wheel_speeds_of_rims_are_in_the_unit_of_their_name(unit: str, factor: f
     assert setup.vehicle.track_width_m == pytest.approx(TRACK, rel=0.03)
 
 
-@pytest.mark.parametrize("times", [7.0, 30.0, 0.02], ids=["pole pairs", "a gear", "turns of ten"])
-@pytest.mark.parametrize("form", ["joints", "numbers"])
+@pytest.mark.parametrize(
+    ("form", "times"),
+    [("joints", 7.0), ("joints", 30.0), ("numbers", 7.0), ("numbers", 30.0), ("numbers", 0.02)],
+)
 def test_wheels_of_a_radius_that_no_vehicle_has_are_on_another_scale(
     form: str, times: float, tmp_path: Path
 ) -> None:
