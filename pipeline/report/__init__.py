@@ -33,12 +33,13 @@ from pipeline.core import (
     format_part,
     format_share,
     mapping_in,
+    name_state,
     naming_os_errors,
     shorten,
     suffix_unit,
 )
 from pipeline.recording import Finding
-from pipeline.store import LOG_NOTES, Manifest, Store, date_runs
+from pipeline.store import LOG_NOTES, LOG_STATES, Manifest, Store, date_runs
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -317,7 +318,7 @@ class Table:
 
 _REPORT = "report.html"
 _VERDICT = 500
-_WITHOUT_RUN = ("failed", "quarantined")
+_WITHOUT_RUN = ("failed", "quarantined", "copy", "ignored")
 _TEXTS = ("day", "vehicle", "terrain", "dataset")
 _NUMBERS = {
     "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
@@ -365,20 +366,29 @@ def render_catalogue(store: Store) -> str:
         scripts=[read_own("report/catalogue.js")],
         columns=columns,
         rows=rows,
-        failed=list_failed(store),
+        counts=[f"{count} {name_state(state)}" for state, count in count_logs(store).items() if count],
+        explained=[
+            {**one, "state": name_state(one["state"])} for one in list_noted(store) if one["state"] != "done"
+        ],
     )
 
 
-def list_failed(store: Store) -> list[dict[str, str]]:
-    """Logs that gave no run in batches, by path: ``path state reason hint``; without those since removed."""
-    failed = []
+def list_noted(store: Store) -> list[dict[str, str]]:
+    """What became of each log, by path: ``path state reason hint``; without those since removed."""
+    noted = []
     for note in store.notes(LOG_NOTES).read_all():
         path = str(mapping_in(note, "log").get("path", ""))
-        if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
+        if note.get("state") in _WITHOUT_RUN and not ("://" in path or Path(path).exists()):
             continue
         texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
-        failed.append({"path": path} | texts)
-    return sorted(failed, key=lambda one: one["path"])
+        noted.append({"path": path} | texts)
+    return sorted(noted, key=lambda one: one["path"])
+
+
+def count_logs(store: Store) -> dict[str, int]:
+    """How many logs of batches came out how, by each of `LOG_STATES`: the numbers of every face."""
+    states = [one["state"] for one in list_noted(store)]
+    return {state: states.count(state) for state in LOG_STATES}
 
 
 def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:

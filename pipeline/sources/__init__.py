@@ -66,6 +66,7 @@ else:
                 "convert",
                 "convert_to",
                 "is_model",
+                "find_ignored",
                 "list_configuration_files",
                 "load_configuration",
                 "merge",
