@@ -12,7 +12,7 @@ from store_samples import read_current
 from pipeline.datasets.compare import Answer, compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import Overlap
-from pipeline.datasets.pairs import Group, Samples, compare_groups
+from pipeline.datasets.pairs import Group, SlipSamples, compare_groups
 from pipeline.report.datasets_page import write_answer
 from pipeline.store import Store
 
@@ -145,7 +145,7 @@ def test_the_same_question_gets_the_same_bytes(store: Store) -> None:
 
 
 def make_group(name: str, *medians: float) -> Group:
-    return Group.of_runs(name, [Samples(np.full(40, one), 40.0) for one in medians])
+    return Group.of_runs(name, [SlipSamples(np.full(40, one), 40.0) for one in medians])
 
 
 def test_a_ground_with_one_run_is_tested_by_the_spread_of_the_others() -> None:
@@ -166,7 +166,7 @@ def test_a_ground_with_one_run_is_tested_by_the_spread_of_the_others() -> None:
 def test_runs_alone_are_compared_by_their_parts_and_only_with_each_other() -> None:
     rng = np.random.default_rng(0)
     groups = [
-        Group.of_runs(name, [Samples(rng.lognormal(level, 0.5, 4_000), 200.0)])
+        Group.of_runs(name, [SlipSamples(rng.lognormal(level, 0.5, 4_000), 200.0)])
         for name, level in (("a", 0.0), ("b", 1.0))
     ]
     (pair,) = compare_groups(groups)
