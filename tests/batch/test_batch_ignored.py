@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from verbs import run_verb
 
+from pipeline.report import _date_errors, render_catalogue
 from pipeline.sources import ConfigurationError, find_ignored
-from pipeline.store import LOG_STATES
+from pipeline.store import LOG_STATES, Store
 
 
 @pytest.fixture
@@ -71,3 +72,23 @@ def test_ignore_is_a_list_of_globs(tmp_path: Path) -> None:
     (tmp_path / "fleet.toml").write_text("ignore = 3\n")
     with pytest.raises(ConfigurationError, match="list of globs"):
         find_ignored(tmp_path / "a.mcap")
+
+
+def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> None:
+    (manifest,) = Store(folder / "results").manifests()
+    steps = manifest.read("ladder").filter(kind="rung").sort("rung")["t_mrmse"].to_list()
+    page = unescape(render_catalogue(Store(folder / "results")))
+    for head in ("error over 2 s, ideal [m]", "error over 2 s, model [m]"):
+        assert f'<button type="button">{head}</button>' in page, "a column that sorts"
+    shown = [float(one) for one in re.findall(r'data-value="([\d.]+)"', page)]
+    assert pytest.approx(steps[0]) in shown
+    assert pytest.approx(steps[-1]) in shown
+    assert "<figure>" not in page, "one date has no course"
+    rows = [
+        {"run": f"r{day}", "day": f"2026-05-0{day}", "ideal": 0.5 * day, "model": 0.1} for day in (1, 2, 4)
+    ]
+    dated = _date_errors(rows)
+    assert dated is not None
+    assert (dated["first"], dated["last"], dated["most"]) == ("2026-05-01", "2026-05-04", "2.00")
+    assert [one["x"] for one in dated["points"]] == pytest.approx([0.0, 1 / 3, 1.0])
+    assert [one["ideal"] for one in dated["points"]] == pytest.approx([0.25, 0.5, 1.0])
