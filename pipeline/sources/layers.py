@@ -389,7 +389,7 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
         fleet: a fleet file that need not be above the log.
 
     Raises:
-        ConfigurationError: ``config_invalid``, `ignore` is no list of globs.
+        ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
     for path in list_configuration_files(log, fleet=fleet):
         if path != fleet and path.name != FLEET_FILE:
@@ -398,7 +398,7 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
         if not isinstance(globs, list) or not all(isinstance(one, str) for one in globs):
             hint = 'Write: ignore = ["2026/dead.mcap", "*/tests/*"], above the first [table].'
             raise ConfigurationError(
-                "config_invalid", "`ignore` is no list of globs", where=str(path), hint=hint
+                "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
         names = _names_under(path.resolve().parent, log.resolve())
         for glob in globs:
