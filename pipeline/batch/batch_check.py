@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from pipeline.batch.batch_plan import forget_pools, measure_results
-from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
+from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.core import SlipError
 from pipeline.logs import LogError, hash_log, locate_recorded
+from pipeline.report import count_logs, list_noted
 from pipeline.store import (
     MANIFEST,
     RUNS,
@@ -218,9 +219,6 @@ def _check_log(run: str, path: str, sha256: str, *, follow_remote: bool) -> LogP
     return LogProblem(run=run, path=path, code=code, what=what)
 
 
-_COUNTED = ("done", "lossy", "refused", "failed", "quarantined", "copy")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Status:
     """Summary of the results.
@@ -229,7 +227,7 @@ class Status:
         runs: runs with results.
         entries: batch outcome of each log, sorted by path; without logs that gave no results and no longer
             exist.
-        counts: logs by state: done, lossy, refused, failed, quarantined, copy.
+        counts: logs by state, each of `LOG_STATES`.
         bytes: size of the results, old generations included.
         old_generations: generations that are not current.
         errors: runs that cannot be read, and folders that were not read.
@@ -248,26 +246,15 @@ class Status:
 def read_status(store: Store) -> Status:
     """Read the status from the results and the ledger."""
     survey = store.survey()
-    known = (entry for entry in Ledger(store).read_all().values() if _still_matters(entry))
-    entries = tuple(sorted(known, key=lambda entry: entry.log.path))
-    states = [entry.state for entry in entries]
+    known = Ledger(store).read_all()
+    entries = tuple(known[note["path"]] for note in list_noted(store) if note["path"] in known)
     size, unread = measure_results(store)
     return Status(
         runs=len(survey.manifests),
         entries=entries,
-        counts={state: states.count(state) for state in _COUNTED},
+        counts=count_logs(store),
         bytes=size,
         old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),
         last=max((entry.at for entry in entries), default=None),
     )
-
-
-def _still_matters(entry: Entry) -> bool:
-    if entry.state in WITH_RESULTS:
-        return True
-    try:
-        return locate_recorded(entry.log.path).exists()
-    except LogError:
-        # Remote addresses are not checked: the log may still exist.
-        return True

@@ -18,7 +18,7 @@ from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger, Task
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
-from pipeline.sources import list_configuration_files, list_presets, read_tables
+from pipeline.sources import find_ignored, list_configuration_files, list_presets, read_tables
 from pipeline.store import (
     LogIdentities,
     LogSighting,
@@ -159,13 +159,16 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[li
 
     Returns:
         The logs to work on, the largest first, so that no worker starts it when the others have finished; and
-        the entries of those to skip: done, copies, quarantined.
+        the entries of those to skip: done, copies, quarantined, ignored.
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
+    ignored = {path: why for path in paths if (why := find_ignored(path, request.options.fleet))}
+    settled = [_ignore(path, why, store) for path, why in ignored.items()]
+    paths = [path for path in paths if path not in ignored]
     hasher = Fingerprinter(request.options)
     tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
-    settled = [task.before for task in tasks if task.before and _is_settled(task, manifests, request)]
+    settled += [task.before for task in tasks if task.before and _is_settled(task, manifests, request)]
     done = {entry.log.path for entry in settled}
     runs, copies = _name_tasks([task for task in tasks if task.log.path not in done], tasks, manifests, store)
     todo: list[Task] = []
@@ -178,6 +181,16 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[li
         elif task.log.path not in done:
             todo.append(replace(task, options=replace(task.options, run=runs.get(task.path, ""))))
     return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled
+
+
+def _ignore(path: Path, why: str, store: Store) -> Entry:
+    """The entry of a log that a fleet file ignores."""
+    log = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0)
+    with suppress(OSError, SlipError):
+        log = see_log(path)
+    entry = Entry(log=log, fingerprint="", state="ignored", reason=why)
+    Ledger(store).write(entry)
+    return entry
 
 
 def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options) -> Task:
@@ -279,10 +292,10 @@ def forget_pools(store: Store) -> None:
 def _hash_runs(store: Store) -> str:
     """Hash of what the pools depend on: versions, runs, and logs without one."""
     # The contracts import a table library, which help and usage errors do not need.
-    from pipeline.report import list_failed  # noqa: PLC0415
+    from pipeline.report import list_noted  # noqa: PLC0415
 
     runs = [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
-    return hash_json([_VERSION, contract_of("datasets").version, runs, list_failed(store)])
+    return hash_json([_VERSION, contract_of("datasets").version, runs, list_noted(store)])
 
 
 def prune_results(store: Store, pruning: Pruning) -> tuple[int, list[SlipError]]:

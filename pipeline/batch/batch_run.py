@@ -67,6 +67,15 @@ class Line:
     peak_bytes: int = 0
     size_bytes: int = 0
 
+    @property
+    def group(self) -> str:
+        """The one of `STATES` under which it is counted and listed: what its results are, new or not."""
+        if self.state != "unchanged":
+            return self.state
+        return (
+            "refused" if self.refused else "lossy" if self.lossy else "copy" if self.reason else "unchanged"
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
@@ -88,9 +97,9 @@ class Outcome:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many logs came out how."""
-        states = [line.state for line in self.lines]
-        return {state: states.count(state) for state in STATES}
+        """How many logs came out how; each counts once."""
+        groups = [line.group for line in self.lines]
+        return {state: groups.count(state) for state in STATES}
 
     @property
     def has_failed(self) -> bool:
@@ -237,7 +246,7 @@ def _settle(entry: Entry) -> Line:
     if entry.state == "copy":
         reason = f"the same content as {entry.reason}"
         return Line(path=entry.log.path, run=entry.reason, state="unchanged", reason=reason)
-    state = "quarantined" if entry.state == "quarantined" else "unchanged"
+    state = entry.state if entry.state in {"quarantined", "ignored"} else "unchanged"
     return _make_line(replace(entry, seconds=0.0, peak_bytes=0), state)
 
 

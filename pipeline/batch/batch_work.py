@@ -14,15 +14,15 @@ import msgspec
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
 from pipeline.core import LONGEST_TEXT, SlipError, objects_in, shorten
-from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Store, stored_contexts
+from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Store, stored_contexts
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #
 # A ledger entry counts only if the results confirm it: a log is done only while the results contain the
 # generation named in its entry. A lost entry costs one reading of the log.
 
-STATES = ("done", "unchanged", "lossy", "refused", "failed", "quarantined")
-"""States of a log; all are counted. A refused log cannot show slip."""
+STATES = ("done", "unchanged", *LOG_STATES[1:], "growing", "left", "skipped")
+"""What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
 

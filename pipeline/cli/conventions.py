@@ -22,7 +22,7 @@ from cyclopts.types import PositiveFloat
 from pipeline import store
 from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.batch import parse_memory_limit, parse_size
-from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, measure_memory, shorten
+from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, measure_memory, name_state, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
@@ -131,15 +131,16 @@ def summarize_error(path: str, error: SlipError) -> dict[str, str]:
 
 
 def format_counts(counts: Mapping[str, int], width: int = 0) -> list[str]:
-    """How many logs came out in each state, in a column of a width; none refused is nothing to say."""
+    """How many logs came out in each state, in a column of a width; of rare states only those with some."""
     return [
-        f"{format_state(state):<14}{count:>{width}}"
+        f"{name_state(state):<14}{count:>{width}}"
         for state, count in counts.items()
-        if count or state != "refused"
+        if count or state in _USUAL
     ]
 
 
-EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
+_USUAL = ("done", "unchanged", "lossy", "failed", "quarantined")
+EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped")
 """States of logs that need a look, in the order in which they are listed."""
 
 
@@ -155,12 +156,6 @@ def explain_logs(title: str, logs: Iterable[tuple[str, str, str]]) -> list[str]:
         )
     ]
     return ["", title, *lines] if lines else []
-
-
-def format_state(state: str) -> str:
-    """What a log came out as, in words."""
-    words = {"lossy": "with losses", "copy": "copies", "growing": "being written"}
-    return {**words, "left": "not started", "skipped": "left out"}.get(state, state)
 
 
 def format_value(value: object) -> str:

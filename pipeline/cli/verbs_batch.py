@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,14 +26,13 @@ from pipeline.cli.conventions import (
     build_options,
     explain_logs,
     format_counts,
-    format_state,
     open_results,
     print_error,
     print_json,
     print_lines,
     summarize_error,
 )
-from pipeline.core import SlipError, measure_memory
+from pipeline.core import SlipError, measure_memory, name_state
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Outcome
@@ -153,10 +151,8 @@ def _report(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
 
 
 def _as_json(outcome: Outcome) -> dict[str, object]:
-    states = [line.state for line in outcome.lines]
     return {
         **outcome.counts,
-        **{name: states.count(name) for name in ("growing", "left", "skipped")},
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
@@ -167,18 +163,10 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 
 def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
-    states = Counter(line.state for line in outcome.lines)
-    rare = {state: states[state] for state in ("growing", "left", "skipped") if states[state]}
-    lines = format_counts({**outcome.counts, **rare}, width=6)
+    lines = format_counts(outcome.counts, width=6)
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    noted = []
-    for line in outcome.lines:
-        # Results that did not change may be of a log with losses, or of one that cannot show slip.
-        notes = {"refused": line.refused, "lossy": line.lossy}
-        also = [name for name, is_so in notes.items() if is_so and name != line.state]
-        noted.append(([line.state, *also], (line.path, line.reason, line.hint)))
-    for state in EXPLAINED:
-        lines += explain_logs(format_state(state), [row for states, row in noted if state in states])
-    copies = [row for states, row in noted if states == ["unchanged"] and row[1]]
-    return lines + explain_logs("copies, counted once", copies)
+    for state in (*EXPLAINED, "copy"):
+        own = [(line.path, line.reason, line.hint) for line in outcome.lines if line.group == state]
+        lines += explain_logs(name_state(state), own)
+    return lines

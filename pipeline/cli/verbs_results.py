@@ -21,14 +21,13 @@ from pipeline.cli.conventions import (
     Results,
     explain_logs,
     format_counts,
-    format_state,
     open_results,
     print_result,
     show_progress,
     summarize_error,
     tidy_line,
 )
-from pipeline.core import INPUT_WORDS, SlipError, format_count, format_size
+from pipeline.core import INPUT_WORDS, SlipError, format_count, format_size, name_state
 
 if TYPE_CHECKING:
     import polars as pl
@@ -195,7 +194,7 @@ def _format_status(status_now: Status) -> list[str]:
     lines += format_counts(status_now.counts)
     for state in EXPLAINED:
         own = [one for one in status_now.entries if one.state == state]
-        lines += explain_logs(format_state(state), [(one.log.path, one.reason, one.hint) for one in own])
+        lines += explain_logs(name_state(state), [(one.log.path, one.reason, one.hint) for one in own])
     lines += [f"damaged: {error}" for error in status_now.errors]
     return lines
 

@@ -61,6 +61,7 @@ from pipeline.core.text import (
     make_plain,
     mark_finding,
     name_first,
+    name_state,
     naming_os_errors,
     pick,
     pick_finite,

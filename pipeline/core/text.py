@@ -143,6 +143,17 @@ _NEARLY_ALL = 0.95
 """Share of the recording below which the compared duration is shown as well."""
 
 INPUTS = ("command", "measured")
+_STATES = {
+    "lossy": "with losses", "copy": "copies", "growing": "being written", "left": "not started",
+    "skipped": "left out",
+}  # fmt: skip
+
+
+def name_state(state: str) -> str:
+    """What a log of a batch came out as, in words."""
+    return _STATES.get(state, state)
+
+
 INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 """Text for each input of the ideal model."""
 

@@ -211,12 +211,14 @@ class _Comparison:
         name: str,
         quantity: str,
         levelled: Mapping[str, Levelled] | None = None,
+        bins: pl.DataFrame | None = None,
     ) -> pl.DataFrame:
         """Table `comparisons` of the groups by a quantity on an input, and notes on what it cannot tell."""
         overlaps = None
-        if levelled is not None:
+        if bins is not None:
+            # Of all that the two drove, whoever else is compared: a pair has one number.
             overlaps = {
-                frozenset((a.name, b.name)): find_overlap(levelled[a.name].bins, a.names, b.names)
+                frozenset((a.name, b.name)): find_overlap(bins, a.names, b.names)
                 for a, b in itertools.combinations(groups, 2)
             }
         rows = compare_groups(groups, untested=self.untested, overlaps=overlaps, levelled=levelled)
@@ -278,7 +280,9 @@ class _Comparison:
                 )
                 self.runs = self.runs.update(levels, on=["run", "input"])
             groups.sort(key=lambda group: group.name)
-            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, driven)
+            tables[name, EQUAL_DRIVING] = self._compare(
+                groups, name, EQUAL_DRIVING, driven, bins.filter(pl.col("input") == name)
+            )
         if short := sorted(set(self.compared.manifests) - set(bins["run"])):
             runs = ", ".join(short)
             self.notes.append(f"no level at equal driving, too little driving on commands: {runs}")

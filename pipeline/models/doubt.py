@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 AT_BOUND, UNDETERMINED, ONE_LIMIT = "at_bound", "undetermined", "one_limit"
 UNDECIDED, TOO_SHORT, FEW_STRETCHES = "undecided", "too_short", "few_stretches"
 FEWEST_STRETCHES = 5
-"""Stretches of driving that an estimate rests on, below which their chance is not told by its interval."""
+"""Stretches of driving below which the interval of an estimate that rests on them is too narrow."""
 
 _TEXTS = {
     AT_BOUND: ("at its bound", "at its bound: a limit of the search, not a measurement"),

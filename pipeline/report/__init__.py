@@ -18,7 +18,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -33,12 +33,13 @@ from pipeline.core import (
     format_part,
     format_share,
     mapping_in,
+    name_state,
     naming_os_errors,
     shorten,
     suffix_unit,
 )
 from pipeline.recording import Finding
-from pipeline.store import LOG_NOTES, Manifest, Store, date_runs
+from pipeline.store import LOG_NOTES, LOG_STATES, Manifest, Store, date_runs
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -317,13 +318,15 @@ class Table:
 
 _REPORT = "report.html"
 _VERDICT = 500
-_WITHOUT_RUN = ("failed", "quarantined")
+_WITHOUT_RUN = ("failed", "quarantined", "copy", "ignored")
 _TEXTS = ("day", "vehicle", "terrain", "dataset")
 _NUMBERS = {
     "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
     "distance": (Column("distance", "m", number=True), 1.0),
     "command": (Column("slip from commands", "m/s", number=True), 1.0),
     "measured": (Column("slip from wheel encoders", "m/s", number=True), 1.0),
+    "ideal": (Column("error over 2 s, ideal", "m", number=True), 1.0),
+    "model": (Column("error over 2 s, model", "m", number=True), 1.0),
 }
 
 
@@ -348,6 +351,7 @@ def render_catalogue(store: Store) -> str:
         *(column for column, _ in _NUMBERS.values()),
         Column("log"),
     ]
+    gathered = _gather_rows(store, manifests) if manifests else []
     rows = [
         {
             "run": row["run"],
@@ -356,7 +360,7 @@ def render_catalogue(store: Store) -> str:
             "complete": row["complete"],
             "cells": list(_list_cells(row)),
         }
-        for row in (_gather_rows(store, manifests) if manifests else [])
+        for row in gathered
     ]
     return render_template(
         "report/templates/catalogue.html",
@@ -365,20 +369,30 @@ def render_catalogue(store: Store) -> str:
         scripts=[read_own("report/catalogue.js")],
         columns=columns,
         rows=rows,
-        failed=list_failed(store),
+        dated=_date_errors(gathered),
+        counts=[f"{count} {name_state(state)}" for state, count in count_logs(store).items() if count],
+        explained=[
+            {**one, "state": name_state(one["state"])} for one in list_noted(store) if one["state"] != "done"
+        ],
     )
 
 
-def list_failed(store: Store) -> list[dict[str, str]]:
-    """Logs that gave no run in batches, by path: ``path state reason hint``; without those since removed."""
-    failed = []
+def list_noted(store: Store) -> list[dict[str, str]]:
+    """What became of each log, by path: ``path state reason hint``; without those since removed."""
+    noted = []
     for note in store.notes(LOG_NOTES).read_all():
         path = str(mapping_in(note, "log").get("path", ""))
-        if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
+        if note.get("state") in _WITHOUT_RUN and not ("://" in path or Path(path).exists()):
             continue
         texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
-        failed.append({"path": path} | texts)
-    return sorted(failed, key=lambda one: one["path"])
+        noted.append({"path": path} | texts)
+    return sorted(noted, key=lambda one: one["path"])
+
+
+def count_logs(store: Store) -> dict[str, int]:
+    """How many logs of batches came out how, by each of `LOG_STATES`: the numbers of every face."""
+    states = [one["state"] for one in list_noted(store)]
+    return {state: states.count(state) for state in LOG_STATES}
 
 
 def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
@@ -394,7 +408,37 @@ def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, 
     for name in ("command", "measured"):
         one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
         facts = facts.join(one, on="run", how="left")
-    return runs.join(facts, on="run", how="left").sort("run").to_dicts()
+    steps = (
+        store.scan("ladder", manifests)
+        .filter(pl.col("kind").cast(pl.String) == "rung")
+        .sort("rung")
+        .collect()
+    )
+    ends = steps.group_by("run").agg(
+        pl.col("t_mrmse").first().alias("ideal"), pl.col("t_mrmse").last().alias("model")
+    )
+    return runs.join(facts, on="run", how="left").join(ends, on="run", how="left").sort("run").to_dicts()
+
+
+def _date_errors(rows: Sequence[Mapping[str, object]]) -> dict[str, object] | None:
+    """Errors over 2 s over the dates of runs, as shares of a figure's width and height; None for one date."""
+    known = [
+        (date.fromisoformat(str(row["day"])).toordinal(), ideal, model, str(row["run"]))
+        for row in rows
+        if row["day"]
+        and isinstance(ideal := row["ideal"], float)
+        and isinstance(model := row["model"], float)
+    ]
+    if len({day for day, *_ in known}) < 2:  # noqa: PLR2004 - dates have an order from two on
+        return None
+    first, last = min(known)[0], max(known)[0]
+    most = max(max(ideal, model) for _, ideal, model, _ in known) or 1.0
+    points = [
+        {"x": (day - first) / (last - first), "ideal": ideal / most, "model": model / most, "run": run}
+        for day, ideal, model, run in sorted(known)
+    ]
+    ends = [date.fromordinal(day).isoformat() for day in (first, last)]
+    return {"points": points, "first": ends[0], "last": ends[1], "most": format_number(most)}
 
 
 def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:

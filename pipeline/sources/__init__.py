@@ -67,6 +67,7 @@ else:
                 "convert",
                 "convert_to",
                 "is_model",
+                "find_ignored",
                 "list_configuration_files",
                 "load_configuration",
                 "merge",

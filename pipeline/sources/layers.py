@@ -363,6 +363,7 @@ def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
 def _match_fleet(path: Path, log: Path) -> list[Tree]:
     """Layers of a fleet file for one log: its plain keys, then every match in order."""
     tree = read_toml(path)
+    tree.pop("ignore", None)
     matches = tree.pop("match", [])
     layers: list[Tree] = [_checked(tree, path)]
     names = _names_under(path.resolve().parent, log)
@@ -376,6 +377,32 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
         if any(fnmatch.fnmatchcase(name, match["glob"]) for name in names):
             layers.append(values)
     return layers
+
+
+def find_ignored(log: Path, fleet: Path | None = None) -> str:
+    """Where a fleet file says that a batch ignores a log: `fleet.toml: ignore = "2026/dead*"`; else empty.
+
+    Args:
+        log: the recording.
+        fleet: a fleet file that need not be above the log.
+
+    Raises:
+        ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
+    """
+    for path in list_configuration_files(log, fleet=fleet):
+        if path != fleet and path.name != FLEET_FILE:
+            continue
+        globs = read_toml(path).get("ignore", [])
+        if not isinstance(globs, list) or not all(isinstance(one, str) for one in globs):
+            hint = 'Write: ignore = ["2026/dead.mcap", "*/tests/*"], above the first [table].'
+            raise ConfigurationError(
+                "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
+            )
+        names = _names_under(path.resolve().parent, log.resolve())
+        for glob in globs:
+            if any(fnmatch.fnmatchcase(name, glob) for name in names):
+                return f'{path}: ignore = "{glob}"'
+    return ""
 
 
 def _names_under(folder: Path, log: Path) -> list[str]:

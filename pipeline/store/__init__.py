@@ -26,7 +26,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
-            "checksums": ("LOG_NOTES",),
+            "checksums": ("LOG_NOTES", "LOG_STATES"),
             "files": (
                 "hold_lock",
                 "make_folder",

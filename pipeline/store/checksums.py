@@ -70,6 +70,8 @@ def decode_checked(data: bytes) -> dict[str, object]:
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs."""
+LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored")
+"""What became of a log of a batch, as its note says; each log counts once."""
 
 
 NOTES = ("batch/", "identities/")

@@ -21,11 +21,14 @@ _MOST = 3
 """Numbers in a sentence; the table lists all."""
 _HEAD = ("", "number", "before -> after", "difference [95 %]", "runs differ")
 _SPREAD_UNKNOWN = "how much runs of this robot differ without a change is not known"
-_ONE_RUN = f"{_SPREAD_UNKNOWN}: three runs a side, or other runs, tell"
+_FEWEST = 3
+"""Runs a side from which on they tell how much runs differ."""
 
 
 def format_check(check: RunsCheck) -> str:
     """What changed, and whether it is more than runs differ, in one to three sentences."""
+    is_few = min(len(check.sides.before), len(check.sides.after)) < _FEWEST
+    unknown = f"{_SPREAD_UNKNOWN}{': three runs a side, or other runs, tell' * is_few}"
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
     sentences = []
@@ -33,17 +36,17 @@ def format_check(check: RunsCheck) -> str:
         pair = "a model and one run" if check.sides.is_model else "one run a side"
         apart = f"these recordings differ in {_list(differs)}, but " if differs else ""
         sentences.append(f"Cannot tell: {pair}")
-        sentences.append(f"{apart}{_ONE_RUN}")
+        sentences.append(f"{apart}{unknown}")
     elif changed:
         sentences.append(f"Changed: {_list(changed)}")
     elif differs:
-        sentences.append(f"No conclusion: the recordings differ in {_list(differs)}, but {_ONE_RUN}")
+        sentences.append(f"No conclusion: the recordings differ in {_list(differs)}, but {unknown}")
     elif known:
         few = "" if check.is_compared else "; most parameters of the model cannot be compared"
         sentences.append(f"No change shown in {format_count(len(known), 'number')}{few}")
         unclear = [one.title for one in check.list_status("unclear")]
         sentences += [f"Too few runs to tell a change of {enumerate_texts(unclear)}"] if unclear else []
-        sentences += [] if check.is_spread_known else [_ONE_RUN]
+        sentences += [] if check.is_spread_known else [unknown]
     else:
         sentences.append("No conclusion: no number is known on both sides")
     outcomes = [one.outcome for one in check.limits]

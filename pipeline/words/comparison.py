@@ -26,17 +26,20 @@ from pipeline.datasets import (
     judge_pair,
 )
 
+_GROUND = "ground alone"
+
 
 def list_answer(answer: Answer, *, main_only: bool = False) -> list[tuple[str, str, str]]:
     """The answer: vehicles with the input, what is compared, and a sentence; two lines each.
 
     Args:
         answer: the comparison.
-        main_only: leave out the other input.
+        main_only: of the other input only what the ground alone does: measured wheels at equal driving.
     """
     lines = []
     for source, quantity in sorted(answer.views, key=lambda view: view[0] != answer.input):
-        if main_only and source != answer.input:
+        is_ground = main_only and source != answer.input
+        if is_ground and (source, quantity) != ("measured", EQUAL_DRIVING):
             continue
         levels = answer.take(answer.levels, (source, quantity))
         pairs = answer.take(answer.comparisons, (source, quantity)).rows(named=True)
@@ -44,7 +47,8 @@ def list_answer(answer: Answer, *, main_only: bool = False) -> list[tuple[str, s
             own = levels.filter(pl.col("dataset").is_in(list(datasets))).sort("value", descending=True)
             rows = [row for row in pairs if row["a"] in datasets and row["b"] in datasets]
             text = _describe(own, rows, equal=quantity == EQUAL_DRIVING)
-            lines.append((f"{family}, {INPUT_WORDS[source]}", QUANTITIES[quantity], text))
+            title = f"{family}, {INPUT_WORDS[answer.input if is_ground else source]}"
+            lines.append((title, _GROUND if is_ground else QUANTITIES[quantity], text))
     return sorted(lines, key=lambda line: [one for one, _, _ in lines].index(line[0]))
 
 

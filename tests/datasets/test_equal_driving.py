@@ -208,6 +208,20 @@ def test_both_questions_are_answered_on_both_inputs_within_a_vehicle(answer: Ans
     assert sure.height == 2
 
 
+def test_a_pair_has_one_driving_in_common_whichever_call_asks(tmp_path: Path) -> None:
+    store = Store(tmp_path / "results")
+    for i, terrain in enumerate(("asphalt", "gravel", "asphalt", "gravel", "ice", "ice", "ice")):
+        run = Run(name=f"{terrain}_{i}", dataset=f"warthog_{terrain}", terrain=terrain, seconds=60.0)
+        write_run(store, run, seed=i)
+
+    def find_common(*datasets: str) -> tuple[object, ...]:
+        found = compare_results(store, Question(datasets=datasets))
+        rows = found.take(found.comparisons, ("command", EQUAL_DRIVING))
+        return rows.filter(a="warthog_asphalt", b="warthog_gravel").select("bins", "overlap").row(0)
+
+    assert find_common("warthog_asphalt", "warthog_gravel") == find_common()
+
+
 def test_the_levels_stand_in_the_table_of_datasets(answer: Answer) -> None:
     rows = {(row["dataset"], row["input"]): row for row in answer.datasets.iter_rows(named=True)}
     for name in FACTORS:

@@ -1,0 +1,94 @@
+"""Counts and lists of a batch are those of one table on every face; a dead log can be ignored."""
+
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+import pytest
+from verbs import run_verb
+
+from pipeline.report import _date_errors, render_catalogue
+from pipeline.sources import ConfigurationError, find_ignored
+from pipeline.store import LOG_STATES, Store
+
+
+@pytest.fixture
+def folder(place: Path) -> Path:
+    """A whole log, its copy, one that is cut, one that is no log, and one that is ignored."""
+    whole = (place / "field" / "wide.mcap").read_bytes()
+    (place / "field" / "twin.mcap").write_bytes(whole)
+    (place / "field" / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    (place / "field" / "text.mcap").write_text("this is no recording\n" * 100)
+    (place / "field" / "dead.mcap").write_text("nor is this\n" * 100)
+    (place / "field" / "fleet.toml").write_text('ignore = ["dead*"]\n')
+    return place
+
+
+def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
+    words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season")
+    words = (*words, "--notify", "cat > told.json", "--json")
+    for number in range(2):
+        told = json.loads(run_verb(*words, cwd=folder).stdout)
+        status = json.loads(run_verb("results", "status", "--results", "season", "--json", cwd=folder).stdout)
+        counts = {state: told[state] for state in LOG_STATES}
+        counts["done"] += told["unchanged"]
+        assert counts == {state: status[state] for state in LOG_STATES}, number
+        expected = {"done": 1, "lossy": 1, "failed": 1, "copy": 1, "ignored": 1}
+        assert {state: count for state, count in counts.items() if count} == expected
+        assert len(told["logs"]) == sum(counts.values())
+    sent = json.loads((folder / "told.json").read_text())
+    assert {state: sent[state] for state in LOG_STATES if state != "done"} == {
+        state: counts[state] for state in LOG_STATES if state != "done"
+    }
+    page = unescape((folder / "season" / "index.html").read_text())
+    (line,) = re.findall(r"Logs of batches: (.*)\.</p>", page)
+    assert line == "1 done, 1 with losses, 1 failed, 1 copies, 1 ignored"
+    assert all(name in page for name in ("cut.mcap", "text.mcap", "dead.mcap"))
+    screen = run_verb(*words[:8], cwd=folder).stdout
+    assert re.search(r"^ignored +1$", screen, re.MULTILINE)
+    assert 'ignore = "dead*"' in screen
+
+
+def test_a_log_that_is_no_longer_ignored_is_read(folder: Path) -> None:
+    words = (
+        "batch",
+        "field/dead.mcap",
+        "--settle",
+        "0",
+        "--executor",
+        "inline",
+        "--results",
+        "season",
+        "--json",
+    )
+    assert json.loads(run_verb(*words, cwd=folder).stdout)["ignored"] == 1
+    (folder / "field" / "fleet.toml").unlink()
+    told = json.loads(run_verb(*words, cwd=folder).stdout)
+    assert (told["ignored"], told["failed"]) == (0, 1)
+
+
+def test_ignore_is_a_list_of_globs(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text("ignore = 3\n")
+    with pytest.raises(ConfigurationError, match="list of globs"):
+        find_ignored(tmp_path / "a.mcap")
+
+
+def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> None:
+    (manifest,) = Store(folder / "results").manifests()
+    steps = manifest.read("ladder").filter(kind="rung").sort("rung")["t_mrmse"].to_list()
+    page = unescape(render_catalogue(Store(folder / "results")))
+    for head in ("error over 2 s, ideal [m]", "error over 2 s, model [m]"):
+        assert f'<button type="button">{head}</button>' in page, "a column that sorts"
+    shown = [float(one) for one in re.findall(r'data-value="([\d.]+)"', page)]
+    assert pytest.approx(steps[0]) in shown
+    assert pytest.approx(steps[-1]) in shown
+    assert "<figure>" not in page, "one date has no course"
+    rows = [
+        {"run": f"r{day}", "day": f"2026-05-0{day}", "ideal": 0.5 * day, "model": 0.1} for day in (1, 2, 4)
+    ]
+    dated = _date_errors(rows)
+    assert dated is not None
+    assert (dated["first"], dated["last"], dated["most"]) == ("2026-05-01", "2026-05-04", "2.00")
+    assert [one["x"] for one in dated["points"]] == pytest.approx([0.0, 1 / 3, 1.0])
+    assert [one["ideal"] for one in dated["points"]] == pytest.approx([0.25, 0.5, 1.0])
