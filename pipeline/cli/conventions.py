@@ -328,7 +328,7 @@ def _parse_distance(text: str | None) -> float | None:
         return None
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(m|cm|mm)?", text.strip())
     if match is None or not float(match[1]):
-        raise SlipError("bad_distance", f"{text} is no distance", where="--drove", hint="Give one as 2.00m.")
+        raise SlipError("bad_distance", f"{text} is not a length", where="--drove", hint="Give one as 2.00m.")
     return float(match[1]) * {"mm": 1e-3, "cm": 1e-2}.get(match[2], 1.0)
 
 

@@ -76,15 +76,15 @@ def _swing(case: Case, source: DriveSource) -> bool:
         if size > _MOST_RAD or float(np.abs(np.diff(angle)).sum()) < _SWINGS * size:
             return False
         ranges.append(size)
-    return len(ranges) > 1 and _measure_way(case) > _LARGEST_M * max(ranges)
+    return len(ranges) > 1 and _measure_extent(case) > _LARGEST_M * max(ranges)
 
 
-def _measure_way(case: Case) -> float:
+def _measure_extent(case: Case) -> float:
     """How far the body goes in one direction of its own [m]: by its poses, or else as it is commanded."""
     if case.has_pose:
         body = case.motion.body
-        ways = (np.cumsum(part) for part in (body.real, body.imag) if part.size)
-        return max((float(np.ptp(way)) for way in ways), default=0.0)
+        extents = (np.cumsum(part) for part in (body.real, body.imag) if part.size)
+        return max((float(np.ptp(extent)) for extent in extents), default=0.0)
     command = case.sources.command
     if command is None or command.form is not DriveForm.BODY:
         return 0.0

@@ -109,12 +109,12 @@ class _Follows:
     Attributes:
         expected: shape (m,).
         scale: of the noise.
-        told: whether the blocks of the fit tell what it would be in each block, shape (m,).
+        spanned: whether the blocks of the fit tell what it would be in each block, shape (m,).
     """
 
     expected: Floats
     scale: float
-    told: Flags
+    spanned: Flags
 
     def rate(self, values: Floats) -> Floats:
         """Log-likelihood of every block, shape (m,)."""
@@ -123,12 +123,12 @@ class _Follows:
 
 def _fit(columns: Floats, values: Floats, rows: Flags, least: float) -> _Follows:
     gains, rest = fit_robustly(columns[rows], values[rows])
-    told = _find_told(columns[:, : columns.shape[1] // 3], rows)
-    return _Follows(columns @ gains, float(np.hypot(find_scale(rest), least)), told)
+    spanned = _find_spanned(columns[:, : columns.shape[1] // 3], rows)
+    return _Follows(columns @ gains, float(np.hypot(find_scale(rest), least)), spanned)
 
 
-def _find_told(moved: Floats, rows: Flags) -> Flags:
-    """Whether some blocks drive as each block does, shape (m,): pivots about a wheel tell of no others.
+def _find_spanned(moved: Floats, rows: Flags) -> Flags:
+    """Whether some blocks drive as each block does, shape (m,): pivots about one wheel do not.
 
     Args:
         moved: rates ahead and of the heading, shape (m, 2), or of the wheels that are given, shape (m, 1), by
@@ -298,7 +298,7 @@ def _list_dead(
         goes_on: gain in likelihood where the other signals agree, shape (m,).
     """
     gains = np.column_stack((_rate_repeating(one.values, one.fits), one.broad)) - one.usual[:, None]
-    gains[~(one.there & np.any([fit.told for fit in one.fits], axis=0))] = 0.0
+    gains[~(one.there & np.any([fit.spanned for fit in one.fits], axis=0))] = 0.0
     price, made = price_change(one.values.size), list[Outage]()
     ends = np.append(blocks.steps.start[blocks.begins], np.inf)
     ends[0] = -np.inf

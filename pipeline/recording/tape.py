@@ -72,7 +72,7 @@ def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Findi
     return [Finding("lengths_by_tape", "warning", "vehicle", values)] if known else []
 
 
-def tell_with(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:
+def add_lengths(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:
     """The refusal of a log with the lengths that a tape shows all the same."""
     lines = [one.values["line"] for one in by_tape if one.values["line"]]
     hint = "".join(f" By what was measured by hand, [vehicle] {line}." for line in lines)
