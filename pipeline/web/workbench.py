@@ -198,7 +198,7 @@ class Workbench:
 
     def _try(self, session: Session, ask: Ask) -> Session:
         """Try further effects; unasked only if nothing that the diagnosis found helps."""
-        is_asked = ask.anyway or not any(one["helps"] for one in session.list_offers())
+        is_asked = ask.anyway or not session.list_offers()
         if is_asked and self._find_trial(session, ask.slot) is None:
             if ask.slot in self._trials:
                 self._trials[ask.slot].stopped = True
