@@ -92,10 +92,10 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     effects_wanted, report_wanted = diagnosis, report
     diagnosis &= find_spec("numba") is not None
     report &= find_spec("vl_convert") is not None
-    left_out = ["the effects (Numba)"] * (effects_wanted and not diagnosis)
-    left_out += ["the report (vl-convert)"] * (report_wanted and not report)
-    if left_out:
-        print_note(f"slip: left out, not installed: {' and '.join(left_out)}; to have it: {name_install()}")
+    absent = ["the effects (Numba)"] * (effects_wanted and not diagnosis)
+    absent += ["the report (vl-convert)"] * (report_wanted and not report)
+    if absent:
+        print_note(f"slip: left out, not installed: {' and '.join(absent)}; to have it: {name_install()}")
     options = replace(build_options(choices), report=report, diagnosis=diagnosis, figures=figures)
     options = replace(options, force=force, model=model)
     outcomes: list[Outcome] = []

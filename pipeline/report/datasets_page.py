@@ -35,7 +35,7 @@ from pipeline.report import (
 from pipeline.report.page import render_figures, write_pictures
 from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axis
 from pipeline.store import Store
-from pipeline.words import list_answer, list_shown_notes
+from pipeline.words import list_answer, list_shown_notes, name_series
 
 _ROW = 34
 _MOST_FIGURES = 40
@@ -293,44 +293,56 @@ def write_fleet(store: Store, fleet: Fleet) -> dict[str, Path]:
 
 
 def write_trend(store: Store, trend: Trend) -> dict[str, Path]:
-    """Write `trend.html`; the files by name."""
-    shown = [one for one in trend.series if one.points.height > 1][:_MOST_FIGURES]
-    rows = [(one.group, one.quantity, one.points.height, one.describe()) for one in trend.series]
+    """Write `trend.html`; the files by name. Window norms, which say what medians say, stay in the JSON."""
+    told = [(name_series(one), one) for one in trend.series if not one.quantity.startswith("median_window")]
+    shown = [(name, one) for name, one in told if one.points.height > 1][:_MOST_FIGURES]
+    rows = [(one.group, name, one.points.height, one.describe()) for name, one in told]
     table = pl.DataFrame(rows, schema=["group", "quantity", "runs", "result"], orient="row")
     return _write(
         store,
         "trend.html",
         "Trends",
-        [f"{len(trend.series)} series", format_count(len(trend.keys), "run")],
-        lines=[f"{one.quantity} of {one.group}: {one.describe()}" for one in trend.series if one.is_changed],
-        pictures=[_draw_series(one, f"trend_{number}") for number, one in enumerate(shown)],
+        [f"{len(told)} series", format_count(len(trend.keys), "run")],
+        lines=[f"{name} of {one.group}: {one.describe()}" for name, one in told if one.is_changed],
+        pictures=[_draw_series(one, name, f"trend_{number}") for number, (name, one) in enumerate(shown)],
         tables=[tabulate_frame("All series", table)],
         notes=trend.notes,
         runs=trend.keys,
     )
 
 
-def _draw_series(series: Series, name: str) -> Picture:
-    rows = series.points.with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
-    about = f"runs in the order of their dates, {rows['day'][0]} to {rows['day'][-1]}"
+def _draw_series(series: Series, what: str, name: str) -> Picture:
+    # In UTC on both sides: a browser elsewhere must not show the day before.
+    dates = {"scale": {"type": "utc"}, "axis": {"title": "date", "format": "%Y-%m-%d", "tickCount": 5}}
+    rows = series.points.with_columns(pl.col("day").str.to_date().cast(pl.Datetime("ms")).dt.epoch("ms"))
     dots = (
         Chart.of_rows(name)
         .mark("point", size=46, filled=True, color=theme.SLIP, opacity=0.9)
         .encode(
-            x=encode_column("order:Q", axis={"title": about, "labels": False, "grid": False}),
+            x=encode_column("day:T", **dates),
             y=encode_column("value:Q", axis={"title": None, "format": ",.3~r"}, scale={"zero": False}),
             shape=encode_column("terrain:N", legend={"title": None}),
-            tooltip=["run:N", "day:N", "terrain:N", encode_column("value:Q", format=".4")],
+            tooltip=[
+                "run:N",
+                encode_column("day:T", timeUnit="utcyearmonthdate", format="%Y-%m-%d"),
+                "terrain:N",
+                encode_column("value:Q", format=".4"),
+            ],
         )
     )
     charts = [dots]
     if series.is_changed and series.step is not None:
-        first = rows["run"].to_list().index(series.step.run) - 0.5
-        rows = rows.with_columns(pl.lit(first).alias("step"))
-        charts.append(Chart.of_rows(name).mark("rule", color=theme.ON_COMMAND).encode(x="step:Q"))
+        first = rows["run"].to_list().index(series.step.run)
+        between = (rows["day"][first - 1] + rows["day"][first]) // 2
+        rows = rows.with_columns(pl.lit(between).alias("step"))
+        charts.append(
+            Chart.of_rows(name)
+            .mark("rule", color=theme.ON_COMMAND)
+            .encode(x=encode_column("step:T", **dates))
+        )
     chart = layer(*charts).properties(width=640, height=130, usermeta={"gutter": 60})
     text = series.describe()
-    title = f"{series.quantity} of {series.group}{bracket_unit(series.unit)}"
+    title = f"{what} of {series.group}{bracket_unit(series.unit)}"
     return Picture(name, title, Drawing(chart, {name: rows}, text[:1].upper() + text[1:], text), width="half")
 
 

@@ -435,6 +435,10 @@ class Scene:
     def component_lines(self, component: str) -> Thinned | None:
         """Velocities of `x`, `y` or `w` over time, long: ``t value series``, null where a line breaks."""
         measured = self.velocities if self.velocities is not None else self.main_slip
+        if measured is not None and "outlier" in measured.columns:
+            # A wrong pose, often at the end of a segment, is no speed.
+            known = pl.when(~pl.col("outlier")).then(pl.col(f"v_{component}"))
+            measured = measured.with_columns(known.alias(f"v_{component}"))
         lines = [] if measured is None else [(measured, f"v_{component}", "velocity")]
         return self._join_lines(
             [(frame, f"f_{component}", name) for name, frame in self.slip.items()] + lines

@@ -27,7 +27,7 @@ SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 
 Channel = dict[str, object]
 
-_TYPES = {"Q": "quantitative", "N": "nominal"}
+_TYPES = {"Q": "quantitative", "N": "nominal", "T": "temporal"}
 
 
 def encode_column(name: str, **look: object) -> Channel:

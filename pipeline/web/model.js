@@ -16,7 +16,7 @@ export const buildModel = (pane) => {
   const cards = session.effects.map((effect) => buildCard(pane, effect));
   model.replaceChildren(
     h("h2", {}, "Model"),
-    cards.length ? h("ul", { class: "cards" }, cards) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
+    cards.length ? foldCards(pane, h("ul", { class: "cards" }, cards)) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
     h("h2", {}, "Add an effect"),
     buildNext(pane),
     buildFormula(pane));
@@ -30,6 +30,9 @@ export const buildModel = (pane) => {
   }
   if (focus) model.querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };
+
+// Beside another model the cards would push its figures off the screen.
+const foldCards = (pane, cards) => (pane.beside ? h("details", { class: "folded-cards" }, h("summary", {}, `Effects (${cards.children.length})`), cards) : cards);
 
 // What an effect does here, or its formula where it is one that anybody reads.
 export const nameEffect = (effect) => {

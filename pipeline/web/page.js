@@ -77,7 +77,7 @@ const arrange = (two) => {
     pane.showRuns(listed.runs);
     pane.shown = () => showDifference(find("difference"), panes.a, panes.b);
     pane.moved = () => drawDifference(find("apart"), panes.a, panes.b);
-    pane.place(two || narrow.matches ? null : find("side"), narrow.matches);
+    pane.place(two || narrow.matches ? null : find("side"), narrow.matches, two);
   }
   showDifference(find("difference"), panes.a, panes.b);
   drawDifference(find("apart"), panes.a, panes.b);

@@ -40,9 +40,16 @@ export class Pane {
   }
 
   // Beside the figures where there is room; on a narrow page below the first ones.
-  place(side, narrow) {
-    if (side) side.replaceChildren(this.model);
-    else this.root.insertBefore(this.model, narrow ? this.tabs.root : this.first);
+  // Of two, the paths come first: their errors stand above them.
+  place(side, narrow, two) {
+    if (this.beside !== two && this.state) {
+      this.beside = two;
+      buildModel(this);
+    }
+    this.beside = two;
+    const { hero, glance, model, first } = this;
+    this.tabs.root.before(...(two ? [first, hero, glance, model] : narrow ? [hero, glance, first, model] : [hero, glance, model, first]));
+    if (side) side.replaceChildren(model);
   }
 
   // Marking by dragging, or by numbers for those who use keys.

@@ -35,7 +35,7 @@ export const toast = (text, word, action) => {
   place.append(" ", h("button", { type: "button", class: "drop", title: "close this notice", "aria-label": "close this notice", onclick: untoast }, "×"));
   place.hidden = false;
   clearTimeout(toast.timer);
-  toast.timer = setTimeout(untoast, 9000);
+  toast.timer = setTimeout(untoast, 10000);
 };
 
 const read = async (answer) => {

@@ -70,6 +70,7 @@ else:
                 "format_fleet",
                 "format_map",
                 "format_trend",
+                "name_series",
                 "summarize_map",
             ),
             "models": (

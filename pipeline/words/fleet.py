@@ -1,8 +1,10 @@
 """Runs together on one screen: parameters of a fleet by level, their course over dates, the map."""
 
 from pipeline.core import INPUT_WORDS, align_rows, format_count, suffix_unit
-from pipeline.datasets import Band, DeploymentMap, Fleet, Trend
+from pipeline.datasets import Band, DeploymentMap, Fleet, Series, Trend
+from pipeline.models import name_number
 
+_SLIP = {"median_modulus": "median slip modulus", "median_window_norm": "slip over 2 s windows"}
 _MOST_NUMBERS = 8
 """Parameters of a vehicle on a screen of 24 lines, those of most runs first."""
 
@@ -40,6 +42,15 @@ def _format_band(band: Band) -> tuple[str, str, str]:
     ends = [(band.low, band.high), (band.another_low, band.another_high)]
     texts = ["-" if low is None or high is None else f"{low:.3g} to {high:.3g}" for low, high in ends]
     return f"{band.value:.3g}", texts[0], texts[1]
+
+
+def name_series(series: Series) -> str:
+    """What a series is of, in words: `median slip modulus from commands`, `effective track (...)`."""
+    effect, _, parameter = series.quantity.partition(".")
+    if parameter:
+        return f"{name_number(effect, parameter)} ({series.quantity})"
+    name, _, source = series.quantity.removesuffix(")").partition(" (")
+    return f"{_SLIP[name]} {INPUT_WORDS[source]}"
 
 
 def format_trend(trend: Trend) -> list[str]:
