@@ -592,15 +592,15 @@ def _do_without_pose(chosen: Choice, given: Given, refused: Finding) -> Choice:
     from pipeline.recording.pose_choice import replace_pose  # noqa: PLC0415 - heavy
 
     rest = [one for one in chosen.ratings[1:] if not (one.refusal or one.from_wheels)]
-    told = replace(chosen, findings=(*chosen.findings, refused))
+    noted = replace(chosen, findings=(*chosen.findings, refused))
     if rest:
-        return _compare(told, replace(given, sources=replace_pose(given.sources, rest)))
+        return _compare(noted, replace(given, sources=replace_pose(given.sources, rest)))
     bare = replace(given.sources, pose=None)
-    alone = _let_wheels_stand_in(replace(told, sources=bare, recording=None), replace(given, sources=bare))
+    alone = _let_wheels_stand_in(replace(noted, sources=bare, recording=None), replace(given, sources=bare))
     if alone.recording is not None:
         return alone
     error = Finding("pose_contradicts_itself", "error", "pose", {"source": refused.values["source"]})
-    return replace(told, findings=(*told.findings, error))
+    return replace(noted, findings=(*noted.findings, error))
 
 
 _STEADY = 5.0

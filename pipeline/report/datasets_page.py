@@ -294,16 +294,16 @@ def write_fleet(store: Store, fleet: Fleet) -> dict[str, Path]:
 
 def write_trend(store: Store, trend: Trend) -> dict[str, Path]:
     """Write `trend.html`; the files by name. Window norms, which say what medians say, stay in the JSON."""
-    told = [(name_series(one), one) for one in trend.series if not one.quantity.startswith("median_window")]
-    shown = [(name, one) for name, one in told if one.points.height > 1][:_MOST_FIGURES]
-    rows = [(one.group, name, one.points.height, one.describe()) for name, one in told]
+    named = [(name_series(one), one) for one in trend.series if not one.quantity.startswith("median_window")]
+    shown = [(name, one) for name, one in named if one.points.height > 1][:_MOST_FIGURES]
+    rows = [(one.group, name, one.points.height, one.describe()) for name, one in named]
     table = pl.DataFrame(rows, schema=["group", "quantity", "runs", "result"], orient="row")
     return _write(
         store,
         "trend.html",
         "Trends",
-        [f"{len(told)} series", format_count(len(trend.keys), "run")],
-        lines=[f"{name} of {one.group}: {one.describe()}" for name, one in told if one.is_changed],
+        [f"{len(named)} series", format_count(len(trend.keys), "run")],
+        lines=[f"{name} of {one.group}: {one.describe()}" for name, one in named if one.is_changed],
         pictures=[_draw_series(one, name, f"trend_{number}") for number, (name, one) in enumerate(shown)],
         tables=[tabulate_frame("All series", table)],
         notes=trend.notes,
