@@ -75,7 +75,7 @@ WORDS: list[tuple[str, str]] = [
     ("model add husky.toml effective_track --on text.mcap", "text.mcap"),
     ("model add husky.toml drive_lag --on", "--on names no run"),
     ("model add husky.toml drive_lag --on field/wide --input measured", "acts between command and wheels"),
-    ("model add husky.toml slope_creep --on field/wide", "is not supported by the data"),
+    ("model add husky.toml slope_creep --on field/wide --quiet", "is not supported by the data"),
     ("model drop husky.toml drive_lag --on field/wide", "drive_lag"),
     ("model remove husky.toml drive_lag --on field/wide", "drive_lag"),
     ("model fit husky.toml --on text.mcap", "text.mcap"),
@@ -158,7 +158,7 @@ HEAD = '[vehicle]\npreset = "husky_a200"\n'
 TRACK = '[[effect]]\nid = "effective_track"\n'
 FORMULA = '[[effect]]\nid = "w"\nv_y = "k * v0"\n'
 MODELS = [
-    (HEAD + TRACK + "k = 25.0\n", "5: .*outside of 0.2 to 10"),
+    (HEAD + TRACK + "k = 25.0\n", "5: .*outside of 0.1 to 20"),
     (HEAD + TRACK + "q = 2.0\n", "5: .*no parameter 'q'"),
     (HEAD + TRACK + 'k = "wide"\n', "5: .*is not a parameter"),
     (HEAD + TRACK + "k = { value = 1.7, low = 1.9, high = 1.6 }\n", "5: .*low = 1.9 .* is above its high"),

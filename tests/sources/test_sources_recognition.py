@@ -121,8 +121,7 @@ def test_where_description_and_preset_differ_both_are_said() -> None:
     found = recognize_vehicle([], {}, read_description(wide))
     assert found.vehicle.id == "turtlebot3_burger"
     (note,) = found.notes
-    assert "0.26" in note
-    assert "0.16" in note
+    assert (note["described"], note["known"]) == (0.26, 0.16)
 
 
 def test_a_fitted_geometry_is_compared_with_the_platforms() -> None:
