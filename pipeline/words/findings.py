@@ -875,8 +875,8 @@ def _unit_of_wheels(of: Values) -> str:
     if "rolled_m" in of:
         text += (
             f": in rad/s they would be those of wheels with a radius of {of['rolled_m']:.3g} m. They are "
-            f"{of['times']:.3g} times those of wheels of {of['usual_m']} m, as ticks are, or turns of a "
-            "motor before its gear, or of its field by its pole pairs"
+            f"{of['times']:.3g} times those of wheels of {of['usual_m']} m, as ticks are, or turns "
+            "before a gear, or those of a motor's field by its pole pairs"
         )
     if "taken_m" in of:
         taken = f"taken as those of wheels of {of['taken_m']} m, which alters no slip"
