@@ -137,8 +137,8 @@ class TruthSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         turns: whole and part turns on the spot as counted, to a tenth.
     """
 
-    distance_m: Annotated[float, msgspec.Meta(gt=0.0, le=1e5)] | None = None
-    turns: Annotated[float, msgspec.Meta(gt=0.0, le=1e4)] | None = None
+    distance_m: Annotated[float, msgspec.Meta(ge=1e-3, le=1e5)] | None = None
+    turns: Annotated[float, msgspec.Meta(ge=1e-3, le=1e4)] | None = None
 
 
 class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
