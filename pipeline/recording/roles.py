@@ -201,14 +201,14 @@ def _leave_out_others(rivals: Sequence[Candidate]) -> list[Candidate]:
 
     Any command of a vehicle that drives ahead explains a part of that, by its mean.
     """
-    kept = list(rivals)
+    likely = list(rivals)
     for index, axis in enumerate(("ahead", "turned")):
         shares = {id(one): one.reading.explained.shares[index] for one in rivals}
         shown = [
             shares[id(one)] for one in rivals if not one.is_measured and one.reading.explained.sign(axis)
         ]
-        kept = [one for one in kept if shares[id(one)] >= _UNLIKE * max(shown, default=0.0)]
-    return kept
+        likely = [one for one in likely if shares[id(one)] >= _UNLIKE * max(shown, default=0.0)]
+    return likely
 
 
 _HELD = 0.5
