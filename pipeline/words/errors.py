@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 
 from pipeline.core import (
     enumerate_texts,
@@ -80,8 +81,10 @@ def format_step(errors: Errors) -> str:
 
 
 def name_region(region: Region) -> str:
-    """A region in words; empty where a stored diagnosis names none of those there are."""
-    return REGIONS.get(region.id, "").format(*region.limits)
+    """A region in words; empty where a stored diagnosis names none of those there are, or not its limits."""
+    with suppress(IndexError):
+        return REGIONS.get(region.id, "").format(*region.limits)
+    return ""
 
 
 def describe_region(region: Region) -> str:

@@ -40,7 +40,7 @@ def test_what_is_new_is_told_once_as_the_json_of_the_batch(field: Path, original
     answer = ask_verb(*words, code=1)
     assert read_message() == answer
     broken, cut = answer["notified"]
-    assert "broken.mcap: this is not an MCAP file" in broken
+    assert "broken.mcap: it is a text, not an MCAP file" in broken
     assert "cut.mcap: the chunk" in cut
     assert ask_verb(*words, code=1)["notified"] == []
     assert count_told() == 1

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -57,7 +57,7 @@ def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: p
     vehicle, recording = read_recording(manifest)
     monkeypatch.setattr(
         "pipeline.estimation.ladder.estimate_floor",
-        lambda *given: replace(estimate_floor(*given), t_mrmse_m=0.0, r_mrmse_rad=0.0),
+        lambda *given: structs.replace(estimate_floor(*given), t_mrmse_m=0.0, r_mrmse_rad=0.0),
     )
     monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
     diagnosis = diagnose_runs([recording], vehicle)

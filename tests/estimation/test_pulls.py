@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 @pytest.mark.parametrize(
     ("effect", "value", "said"),
-    [("yaw_pull", -0.25, "pulls to the right"), ("lateral_pull", 0.1, "cm to the left per metre ahead")],
+    [
+        ("yaw_pull", -0.25, "to the right per metre ahead"),
+        ("lateral_pull", 0.1, "cm to the left per metre ahead"),
+    ],
 )
 def test_a_pull_is_named_by_how_much_per_metre(effect: str, value: float, said: str, tmp_path: Path) -> None:
     scene = Scenario(
