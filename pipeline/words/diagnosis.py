@@ -526,7 +526,12 @@ def _format_unobservable(run: RunDiagnosis) -> list[str]:
 def _format_detectable(run: RunDiagnosis) -> str:
     """Detection limits of effects that were not identified, the smallest first."""
     known = {kind.id: kind for kind in list_effects()}
-    usual = {one.id: known[one.id]().parameter(one.parameter) for one in run.detectable if one.id in known}
+    usual = {
+        one.id: parameter
+        for one in run.detectable
+        for parameter in (known[one.id].parameters if one.id in known else ())
+        if parameter.name == one.parameter
+    }
     sharpest = sorted(
         (one for one in run.detectable if one.id in usual),
         key=lambda one: one.size / usual[one.id].usual_size,
