@@ -65,6 +65,11 @@ def weigh_addition(before: LadderStep, after: LadderStep, name: str) -> Addition
     return Addition(effect, after.errors, _measure_remaining(before.errors, after.errors), refusal)
 
 
+def list_beyond(data: EstimationData, model: Model, known: Sequence[Effect]) -> list[Effect]:
+    """Of the effects of a diagnosis those that a model lacks, and that act on the input."""
+    return [one for one in data.active_effects(Model(model.vehicle, tuple(known))) if one.id not in model]
+
+
 def explain_refusals(step: LadderStep, names: Collection[str]) -> dict[str, str]:
     """Why effects of a fitted model would not be accepted beside its others, by id; empty where they would.
 
@@ -76,11 +81,13 @@ def explain_refusals(step: LadderStep, names: Collection[str]) -> dict[str, str]
     refusals = dict[str, str]()
     for fit in step.fitted.fits:
         asked = [one for one in fit.state.effects if one.id in names and fit.path.owns(one)]
-        matrix = Matrix(fit, (), data.largest) if asked else None
+        if not asked:
+            continue
+        matrix = Matrix(fit, (), data.largest)
         for effect in asked:
             if idle := explain_idle(effect, step.effects):
                 refusals[effect.id] = f"it {idle}"
-            elif matrix is not None and (why := judge(fit, effect, matrix, data.conditions).refusal):
+            elif why := judge(fit, effect, matrix, data.conditions).refusal:
                 refusals[effect.id] = _explain_values(effect, data.conditions) or why
     return refusals
 
@@ -130,9 +137,7 @@ class Tries:
         self._base = judge_whole(data, model)
         self._moves: dict[str, Floats] = {}
         self.before = self._base.errors
-        first = [
-            one for one in data.active_effects(Model(model.vehicle, tuple(known))) if one.id not in model
-        ]
+        first = list_beyond(data, model, known)
         ids = {one.id for one in first}
         promising = [candidate() for candidate in list_promising(data, self._base.fitted)]
         self.candidates = [*first, *(one for one in promising if one.id not in ids)]

@@ -36,7 +36,7 @@ from pipeline.estimation.plausibility import is_nameable, is_possible, is_too_sm
 from pipeline.models import Search as HowSearched
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Mapping
 
     from pipeline.core import Floats
     from pipeline.estimation.model_state import ModelState
@@ -450,10 +450,9 @@ class Search:
             if not self.path.is_followed(fit.residual):
                 return fit_path(self.path, fit.state.drop({*fit.ids} - self.given), noise=fit.noise), {}
             judged = self.judge_all(fit)
-            refused = [one for one in judged.values() if not one.is_proven]
-            if not refused:
+            least = _find_least_proven(judged)
+            if least is None:
                 return fit, judged
-            least = min(refused, key=lambda one: (one.frequency, one.t, one.effect)).effect
             self._excluded.add(least)
             fit = self.search_possible(fit_path(self.path, fit.state.drop([least]), noise=fit.noise))
 
@@ -481,10 +480,10 @@ class Search:
                 continue
             fit = fit_path(self.path, self._look(matrix, best)[2], noise=matrix.noise)
             judged = self.judge_all(fit)
-            refused = [one for one in judged.values() if not one.is_proven]
-            if not refused:
+            unproven = _find_least_proven(judged)
+            if unproven is None:
                 return fit, judged
-            excluded.add(min(refused, key=lambda one: (one.frequency, one.t, one.effect)).effect)
+            excluded.add(unproven)
 
     def judge_all(self, fit: PathFit) -> dict[str, Judged]:
         """How each effect of a model is judged, but for given ones and those too small for a name."""
@@ -611,7 +610,7 @@ def judge(
     else:
         brings = _sum_blocks(base, fit.noise) - _sum_blocks(fit, fit.noise)
         price = _find_price(fit.state, fit.numbers) - _find_price(base.state, base.numbers)
-        frequency = float(np.mean(_resample(brings.size) @ brings > price))
+        frequency = _count_paying(brings, price)
     costs = [list_costs(path, fit.noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
     own = list_costs(path, fit.noise, base.residual) - list_costs(path, fit.noise, fit.residual)
@@ -647,8 +646,19 @@ def judge(
 def _find_frequency(matrix: Matrix, change: Change, without: Change) -> float:
     """Share of resampled recordings in which what a set has beyond another pays for its numbers."""
     brings = matrix.sum_blocks(without) - matrix.sum_blocks(change)
-    price = matrix.find_price(change) - matrix.find_price(without)
+    return _count_paying(brings, matrix.find_price(change) - matrix.find_price(without))
+
+
+def _count_paying(brings: Floats, price: float) -> float:
+    """Share of resampled recordings in which what each block brings, shape (blocks,), exceeds a price."""
     return float(np.mean(_resample(brings.size) @ brings > price))
+
+
+def _find_least_proven(judged: Mapping[str, Judged]) -> str | None:
+    """The effect that is least proven of those that are not; None where all are."""
+    refused = (one for one in judged.values() if not one.is_proven)
+    least = min(refused, key=lambda one: (one.frequency, one.t, one.effect), default=None)
+    return None if least is None else least.effect
 
 
 def _drop_effect(fit: PathFit, name: str, residual: Floats) -> tuple[PathFit, bool]:
@@ -680,11 +690,11 @@ def _drop_effect(fit: PathFit, name: str, residual: Floats) -> tuple[PathFit, bo
         adapted = residual - combine_columns(moving, moved)
     linear = replace(linear, residual=adapted)
     there = state.move([free[index] for index in smooth], moved.tolist())
-    costs = [
+    own, expected, real = (
         float(list_costs(path, fit.noise, one).sum())
         for one in (fit.residual, adapted, path.find_residuals(there))
-    ]
-    if costs[2] - costs[1] <= EQUAL + _AS_EXPECTED * max(costs[1] - costs[0], 0.0):
+    )
+    if real - expected <= EQUAL + _AS_EXPECTED * max(expected - own, 0.0):
         return linear, True
     starts = (begin_fit(path, one, fit.noise) for one in (state, there))
     return fit_roughly(min(starts, key=lambda one: one.score), _STEPS), False

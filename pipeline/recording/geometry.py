@@ -47,11 +47,6 @@ class Length:
         """Ends of the 95 % interval [m]."""
         return self.value - NORMAL_95 * self.error, self.value + NORMAL_95 * self.error
 
-    def format_range(self) -> str:
-        """Ends of the 95 % interval."""
-        low, high = self.interval
-        return f"{low:.3g} to {high:.3g} m"
-
 
 def take_clear(value: float, share: float) -> Length | None:
     """A length of this value [m] and relative standard error; None if it is not clear."""

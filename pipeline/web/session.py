@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from pipeline.estimation.additions import explain_refusals, weigh_addition
+from pipeline.estimation.additions import explain_refusals, list_beyond, weigh_addition
 from pipeline.estimation.driving_need import find_doubts
 from pipeline.models import Doubt, Effect, Model, ModelFile, find_effect, name_term
 from pipeline.results import Errors, RunDiagnosis, Step, read_diagnosed, read_model
@@ -108,9 +108,8 @@ class Session:
         """What the diagnosis has beyond the model and would be accepted, as JSON, the largest gain first."""
         prepared, step, model = self.prepared, self.step, self.begin(self.step.model)
         before = prepared.judge(model).step
-        missing = tuple(one for one in self.diagnosed if one.id not in step.order)
-        active = prepared.data.active_effects(Model(prepared.vehicle, missing))
-        weighed = (weigh_addition(before, prepared.judge(model + one).step, one.id) for one in active)
+        missing = list_beyond(prepared.data, model, self.diagnosed)
+        weighed = (weigh_addition(before, prepared.judge(model + one).step, one.id) for one in missing)
         accepted = [one for one in weighed if one is not None and not one.refusal]
         errors = prepared.score(step.model, step.wheel_delay_s)
         return [show_addition(one, errors, model) for one in sorted(accepted, key=lambda one: one.remaining)]

@@ -31,21 +31,24 @@ def format_check(check: RunsCheck) -> str:
     unknown = f"{_SPREAD_UNKNOWN}{': three runs a side, or other runs, tell' * is_few}"
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
-    sentences = [f"Changed: {_list(changed)}"] if changed else []
+    sentences = list[str]()
     if check.is_single and known:
         pair = "a model and one run" if check.sides.is_model else "one run a side"
         apart = f"these recordings differ in {_list(differs)}, but " if differs else ""
+        sentences += [f"Changed: {_list(changed)}"] if changed else []
         sentences.append(f"Cannot tell: {pair}")
         sentences.append(f"{apart}{unknown}")
-    elif differs and not changed:
+    elif changed:
+        sentences.append(f"Changed: {_list(changed)}")
+    elif differs:
         sentences.append(f"No conclusion: the recordings differ in {_list(differs)}, but {unknown}")
-    elif known and not changed:
+    elif known:
         few = "" if check.is_compared else "; most parameters of the model cannot be compared"
         sentences.append(f"No change shown in {format_count(len(known), 'number')}{few}")
         unclear = [one.title for one in check.list_status("unclear")]
         sentences += [f"Too few runs to tell a change of {enumerate_texts(unclear)}"] if unclear else []
         sentences += [] if check.is_spread_known else [unknown]
-    elif not changed:
+    else:
         sentences.append("No conclusion: no number is known on both sides")
     outcomes = [one.outcome for one in check.limits]
     if check.limits:
