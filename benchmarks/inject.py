@@ -33,10 +33,10 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.models import find_effect
+from pipeline.models import Number, find_effect
 from pipeline.recording import Extraction, Given, extract_tables
 from pipeline.recording.log_setup import set_up_log
-from pipeline.results import Named, Value
+from pipeline.results import Named
 from pipeline.sources import DriveSection, DriveSource, Sources, Vehicle
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
@@ -48,7 +48,7 @@ _MOVED = 0.2
 # The same where the unchanged recording has a number that is too unsure to be told.
 _UNTOLD = 0.4
 _VERDICTS = ("recovered", "reported", "one of", "edge", "undecided", "cannot", "number", "missed")
-Number = tuple[float, float]
+Told = tuple[float, float]
 _UNCHANGED = Injection("nothing", lambda tables, _: tables)
 Json = dict[str, Any]
 
@@ -67,13 +67,13 @@ class Answer:
         rivals: numbers of effects that are one explanation of several, each in the place of the others.
     """
 
-    numbers: Mapping[str, Number]
+    numbers: Mapping[str, Told]
     findings: Mapping[str, float | None] = field(default_factory=dict)
     undecided: Sequence[str] = ()
     unobservable: Sequence[str] = ()
-    estimates: Mapping[str, Number] = field(default_factory=dict)
+    estimates: Mapping[str, Told] = field(default_factory=dict)
     detectable: Mapping[str, float] = field(default_factory=dict)
-    rivals: Mapping[str, Number] = field(default_factory=dict)
+    rivals: Mapping[str, Told] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
@@ -89,11 +89,11 @@ class Answer:
         """Ids of the effects that are named, or one explanation of several."""
         return self.names | {*self.undecided}
 
-    def find_told(self, label: str) -> Number | None:
+    def find_told(self, label: str) -> Told | None:
         """A number that is told: of an effect that is named, or one of several."""
         return self.numbers.get(label) or self.rivals.get(label)
 
-    def find_number(self, label: str) -> Number:
+    def find_number(self, label: str) -> Told:
         """What is known of a number: as told, as estimated, or that it is less than would have been seen."""
         neutral = (find_neutral(label), self.detectable.get(label, 0.0))
         return self.find_told(label) or self.estimates.get(label, neutral)
@@ -183,11 +183,11 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
     )
 
 
-def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
+def _list_numbers(effects: Iterable[Named]) -> dict[str, Told]:
     return _list_values((effect.id, effect.parameters) for effect in effects)
 
 
-def _list_values(told: Iterable[tuple[str, Mapping[str, Value]]]) -> dict[str, Number]:
+def _list_values(told: Iterable[tuple[str, Mapping[str, Number]]]) -> dict[str, Told]:
     return {
         f"{effect}.{name}": (value.value, value.half)
         for effect, values in told
@@ -300,7 +300,7 @@ def is_recovered_together(injection: Injection, before: Answer, after: Answer) -
     return is_close((sums[0][0] + abs(moves[0]), sums[0][1]), sums[1])
 
 
-def _add_up(label: str, value: float, half: float = 0.0) -> Number:
+def _add_up(label: str, value: float, half: float = 0.0) -> Told:
     """A number that adds up with others and is zero without effect: the logarithm of a ratio."""
     return (math.log(value), math.log1p(half / value)) if find_neutral(label) == 1.0 else (value, half)
 

@@ -11,12 +11,11 @@ import msgspec
 import polars as pl
 
 from pipeline.analysis import STAGES, Options
-from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory
+from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory, round_numbers
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, Loss
 from pipeline.recording import POSE_FINDINGS, Finding, Given, extract_tables
 from pipeline.recording.log_setup import LogSetup
-from pipeline.results import round_numbers
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
 from pipeline.stages import align_tables, checks, slip_stage, velocity

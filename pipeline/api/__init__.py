@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from pipeline.api.runs import *
     from pipeline.core import SlipError
     from pipeline.datasets import Question
-    from pipeline.estimation.estimates import list_parameters
     from pipeline.export import list_omitted, require_errors
     from pipeline.export.data_formats import dump_model
 else:
@@ -49,7 +48,6 @@ else:
                 "Model",
                 "effect",
                 "effects",
-                "list_parameters",
                 "load_effects",
             ),
             "model_changes": (

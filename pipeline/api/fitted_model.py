@@ -12,11 +12,10 @@ import polars as pl
 from threadpoolctl import threadpool_limits
 
 from pipeline.api.model_changes import carry_models, change_model, export_file, find_speeds, read_on_runs
-from pipeline.core import INPUT_WORDS, number_in, objects_in
+from pipeline.core import INPUT_WORDS, finite_or_none, number_in, objects_in
 from pipeline.datasets import ModelFit
 from pipeline.estimation import EstimationData, ModelState
 from pipeline.estimation.additions import Tries
-from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.estimation.stored_diagnosis import find_diagnosis
@@ -26,6 +25,7 @@ from pipeline.models import (
     Effect,
     FormulaEffect,
     ModelFile,
+    Number,
     catalogue,
     find_effect,
     list_effects,
@@ -62,21 +62,15 @@ def tabulate_ladder(content: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame(rows, schema={"added": pl.String, **dict.fromkeys(_ERRORS, pl.Float64)})
 
 
-def tabulate_parameters(numbers: Mapping[str, Mapping[str, object]]) -> pl.DataFrame:
+def tabulate_parameters(numbers: Mapping[str, Number]) -> pl.DataFrame:
     """Numbers by ``effect.parameter``: value, 95 % interval (null without one), unit, id of its doubt."""
     rows = [
-        {
-            "parameter": label,
-            **{key: number_in(number, key) for key in ("value", "low", "high")},
-            "unit": str(number.get("unit", "1")),
-            "doubt": str(number.get("doubt", "")),
-        }
-        for label, number in numbers.items()
+        (label, *map(finite_or_none, (one.value, one.low, one.high)), one.unit, one.doubt)
+        for label, one in numbers.items()
     ]
     values = dict.fromkeys(("value", "low", "high"), pl.Float64)
-    return pl.DataFrame(
-        rows, schema={"parameter": pl.String, **values, "unit": pl.String, "doubt": pl.String}
-    )
+    schema = {"parameter": pl.String, **values, "unit": pl.String, "doubt": pl.String}
+    return pl.DataFrame(rows, schema=schema, orient="row")
 
 
 def write_html(title: str, frame: pl.DataFrame, notes: Sequence[str] = ()) -> str:
@@ -227,7 +221,7 @@ class Model:
     @property
     def parameters(self) -> pl.DataFrame:
         """Its numbers: ``parameter value low high unit``, the 95 % interval of the last fit."""
-        return tabulate_parameters(list_parameters(self.file))
+        return tabulate_parameters(self.file.list_numbers())
 
     def __add__(self, other: str | Effect) -> Self:
         return self.of(replace(self.file, model=self.file.model + _take_effect(other)))
@@ -412,7 +406,7 @@ class Model:
         return export_file(self.file, to, current=None if current is None else Path(current), gate=gate)
 
     def __repr__(self) -> str:
-        numbers = format_parameters(list_parameters(self.file))
+        numbers = format_parameters(self.file.list_numbers(), self.file.list_own())
         return "\n".join([self.file.model.vehicle.name, *(numbers or ["  the ideal model, no effect"])])
 
     def _repr_html_(self) -> str:

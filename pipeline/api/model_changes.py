@@ -56,7 +56,6 @@ class Change:
         return {
             "model": name,
             **self.fit.to_json(),
-            "prior": self.fit.prior_as_json(),
             "carried_over": [_transfer_as_json(str(name), item) for item in self.carried],
         }
 

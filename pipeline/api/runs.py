@@ -351,9 +351,12 @@ class Diagnosis:
             schema={"effect": pl.String, "sentence": pl.String},
         )
         self.parameters = tabulate_parameters(
-            {f"{name}.{key}": mapping_in(mapping_in(one, "parameters"), key)
-             for name, one in effects.items() for key in mapping_in(one, "parameters")}
-        )  # fmt: skip
+            {
+                f"{one.id}.{name}": number
+                for one in diagnosis.effects
+                for name, number in one.parameters.items()
+            }
+        )
         self.ladder = tabulate_ladder(content)
         file = read_diagnosed_model(diagnosis)
         self.model = None if file is None else Model.of(file)

@@ -89,7 +89,7 @@ def show(  # noqa: D417 - the shared option documents itself
     if json:
         sys.stdout.write(api.dump_model(file))
         return CLEAN
-    parameters = words.format_parameters(api.list_parameters(file))
+    parameters = words.format_parameters(file.list_numbers(), file.list_own())
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     lines += _list_idle(file.model)
     if runs := file.list_fitted("runs"):
@@ -172,7 +172,7 @@ def fit(  # noqa: D417 - the shared options document themselves
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
-        changed = replace(file, model=file.model.swap(*neutral), intervals={}, doubts={})
+        changed = replace(file, model=file.model.swap(*neutral), numbers={})
     return _change(model, file, changed, spoken, predict=predict or (), first_s=first_s, prior=prior)
 
 

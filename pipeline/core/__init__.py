@@ -66,6 +66,7 @@ from pipeline.core.text import (
     pick,
     pick_finite,
     round_digits,
+    round_numbers,
     shorten,
     split_interval,
     suffix_unit,

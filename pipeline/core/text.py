@@ -341,6 +341,15 @@ def finite_or_none(value: float, digits: int | None = None) -> float | None:
     return value if digits is None else round_digits(value, digits)
 
 
+def round_numbers(value: object, digits: int | None = JSON_DIGITS) -> object:
+    """An object with numbers of so many digits, by default of JSON; None for those that are not finite."""
+    if isinstance(value, float):
+        return finite_or_none(value, digits)
+    if isinstance(value, dict):
+        return {key: round_numbers(one, digits) for key, one in value.items()}
+    return [round_numbers(one, digits) for one in value] if isinstance(value, list | tuple) else value
+
+
 def pick(item: object, *names: str) -> dict[str, Any]:
     """Selected fields of an object by name."""
     return {name: getattr(item, name) for name in names}

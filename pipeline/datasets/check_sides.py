@@ -272,10 +272,13 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
     Without any interval they count as exact. Else those that are not fixed and have none are undetermined.
     """
     estimates = {}
+    is_fitted = any(math.isfinite(number.low) for number in file.numbers.values())
     for label in labels:
         name = label.parameter.name
-        if not file.intervals or label.name in file.intervals or name in label.effect.fixed:
-            low, high = file.intervals.get(label.name, (0.0, 0.0))
-            estimates[label.name] = (label.effect.values[name], max(0.5 * (high - low) / NORMAL_95, 0.0))
+        number = file.find_number(label.effect, label.parameter)
+        width = number.high - number.low
+        if math.isfinite(width) or not is_fitted or name in label.effect.fixed:
+            deviation = 0.5 * width / NORMAL_95 if math.isfinite(width) else 0.0
+            estimates[label.name] = (number.value, deviation)
     terrains = {str(run.get("terrain")) for run in file.list_fitted("runs")}
     return RunReading("model", terrains.pop() if len(terrains) == 1 else "", math.nan, estimates)

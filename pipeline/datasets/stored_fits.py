@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.core import NORMAL_95, finite_or_none
+from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none
 from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.fleet import expect_here
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
-from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import measure_by_terrain
 from pipeline.estimation.ladder import Ladder, ModelAssessment, assess_model, note_fit
@@ -20,7 +19,7 @@ from pipeline.estimation.rivals import (
     judge_rival,
 )
 from pipeline.estimation.run_residuals import Input, InputChoice, choose_input
-from pipeline.models import Effect, Model, ModelFile, cut_interval, find_effect, list_models
+from pipeline.models import Effect, Model, ModelFile, Number, cut_interval, find_effect, list_models
 from pipeline.results import ERRORS_OVER_2S, Errors, as_written, list_rises, to_json
 from pipeline.run import MotionError, MotionRun, cut_run, find_driven, load_motion_run
 from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
@@ -53,16 +52,25 @@ class ModelFit:
         after = self.after.whole
         return explain_refusals(after, set(after.effects).difference(self.before.whole.effects))
 
-    def prior_as_json(self) -> dict[str, dict[str, object]]:
-        """What was known of the numbers before the fit, by label: value, 95 % interval and unit."""
-        values: dict[str, dict[str, object]] = {}
+    def list_numbers(self) -> dict[str, Number]:
+        """The numbers of the effects that were fitted, by label."""
+        ids = self.after.fitted.model.ids
+        return {
+            label: number
+            for label, number in self.file.list_numbers().items()
+            if label.partition(".")[0] in ids
+        }
+
+    def list_prior(self) -> dict[str, Number]:
+        """What was known of the numbers before the fit, by label."""
+        numbers = {}
         for label, (mean, deviation) in self.after.data.paths[0].prior.numbers.items():
             effect, _, name = label.partition(".")
             half = NORMAL_95 * deviation
             parameter = find_effect(effect)().parameter(name)
-            low, high = cut_interval(mean - half, mean + half, parameter.bounds)
-            values[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
-        return values
+            ends = cut_interval(mean - half, mean + half, parameter.bounds)
+            numbers[label] = Number(mean, *ends, parameter.unit)
+        return numbers
 
     def to_json(self) -> dict[str, object]:
         """The keys of `slip model fit --json` that the fit provides."""
@@ -92,10 +100,17 @@ class ModelFit:
                 for terrain, errors in measure_by_terrain(data, after.held_out).items()
             },
             "noise_floor": to_json(self.floor),
-            "parameters": parameters_as_json(
-                self.after.fitted.model, self.after.estimates, self.file.list_doubts()
-            ),
-            "correlated": correlations_as_json(self.after.estimates),
+            "parameters": {label: number.to_json() for label, number in self.list_numbers().items()},
+            "own": [
+                {"run": run, "parameter": label, **number.to_json()}
+                for label, by_run in self.file.list_own().items()
+                for run, number in by_run.items()
+            ],
+            "prior": {label: number.to_json() for label, number in self.list_prior().items()},
+            "correlated": [
+                {"parameters": [one.label, other.label], "correlation": finite_or_none(value, JSON_DIGITS)}
+                for one, other, value in self.after.estimates.list_correlated()
+            ],
             "timing": [
                 {
                     "run": run_residuals.run.name,

@@ -16,9 +16,9 @@ from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import PathFit, whiten_columns
 from pipeline.estimation.intervals import estimate_path
 from pipeline.estimation.run_residuals import Input
-from pipeline.models import LEAST_DELAY_S, Effect, Late, find_late, find_late_effect, list_effects
+from pipeline.models import LEAST_DELAY_S, Effect, Late, Number, find_late, find_late_effect, list_effects
 from pipeline.models import Search as HowSearched
-from pipeline.results import Delays, Detectable, Undecided, Unobservable, Value
+from pipeline.results import Delays, Detectable, Undecided, Unobservable
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 
@@ -51,7 +51,7 @@ def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]
             yield Undecided((name, *names), numbers)
 
 
-def _read_numbers(fit: PathFit, name: str) -> dict[str, Value]:
+def _read_numbers(fit: PathFit, name: str) -> dict[str, Number]:
     """Values of an effect of a model in the first run, with their intervals."""
     return list_first_run(fit.state, estimate_path(fit))[name]
 

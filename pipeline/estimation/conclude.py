@@ -40,6 +40,7 @@ from pipeline.models import (
     Late,
     Model,
     ModelFile,
+    Number,
     find_effect,
     find_late_effect,
     format_model,
@@ -56,7 +57,6 @@ from pipeline.results import (
     Undecided,
     Unexplained,
     Unobservable,
-    Value,
 )
 from pipeline.run import MotionError
 
@@ -193,7 +193,7 @@ def summarize(
     return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
 
 
-def _leave_open(values: Mapping[str, Value]) -> dict[str, Value]:
+def _leave_open(values: Mapping[str, Number]) -> dict[str, Number]:
     """Values of one of several alternatives: each is undecided, unless there is a graver doubt."""
     return {
         name: replace(one, doubt=one.doubt if one.is_undetermined else UNDECIDED, stretches=0)

@@ -12,13 +12,14 @@ from msgspec.structs import replace
 from pipeline.core import Floats, Ints, round_digits
 from pipeline.estimation.intervals import narrow_path
 from pipeline.estimation.window_residuals import count_seconds
-from pipeline.models import FEW_STRETCHES, FEWEST_STRETCHES, TOO_SHORT, Doubt, find_effect
+from pipeline.models import FEW_STRETCHES, FEWEST_STRETCHES, TOO_SHORT, Number, find_effect
 from pipeline.results import INTERVAL_SHARE, DataNeed, GrownEvidence, Growth, Narrowing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.estimation_data import EstimationData
+    from pipeline.estimation.intervals import Estimates
     from pipeline.estimation.model_fit import Fitted
     from pipeline.results import Named
 
@@ -49,22 +50,25 @@ def measure_driven(data: EstimationData) -> tuple[float, float]:
     return float(count_seconds(data.whole).sum()), _LEAST_DRIVING_S[data.source.value]
 
 
-def find_doubts(data: EstimationData, fitted: Fitted) -> dict[str, Doubt]:
-    """What the driving makes doubtful of fitted parameters, by label ``effect.name``.
+def list_numbers(data: EstimationData, fitted: Fitted, estimates: Estimates) -> dict[str, Number]:
+    """Numbers of a fit by label ``effect.name``, with what the driving makes doubtful of them.
 
     All of them where it is too short; else those whose information comes from a few blocks, counted as
-    the square of its sum over the sum of its squares: of blocks that inform equally, their number.
+    the square of its sum over the sum of its squares: of blocks that inform equally, their number. Of those
+    that runs have of their own only the doubt is known.
     """
+    numbers, unknown = estimates.numbers, Number(math.nan)
     driven, least = measure_driven(data)
     if driven < least:
-        return {number.label: Doubt(TOO_SHORT) for number in fitted.free if number.effect}
-    doubts = {}
+        labels = [number.label for number in fitted.free if number.effect]
+        return numbers | {one: replace(numbers.get(one, unknown), doubt=TOO_SHORT) for one in labels}
     for label, curve in narrow_intervals(fitted).items():
         gained = np.diff(curve.values**-2.0, prepend=0.0).clip(0.0)
         count = max(round(float(gained.sum() ** 2 / np.sum(gained**2))), 1) if gained.any() else 0
         if 0 < count < FEWEST_STRETCHES:
-            doubts[label] = Doubt(FEW_STRETCHES, count)
-    return doubts
+            known = numbers.get(label, unknown)
+            numbers[label] = replace(known, doubt=FEW_STRETCHES, stretches=count)
+    return numbers
 
 
 def thin_growth(evidence: Curve | None, widths: Mapping[str, Curve]) -> Growth:

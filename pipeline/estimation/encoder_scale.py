@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from pipeline.models import find_effect
+from pipeline.models import Number, find_effect
 from pipeline.recording import Finding
-from pipeline.results import Named, RunDiagnosis, Value
+from pipeline.results import Named, RunDiagnosis
 from pipeline.run import MotionRun
 
 GIVEN: Final = "encoder_scale_given"
@@ -62,7 +62,7 @@ def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
     return EncoderScale(gain.value, radius.value)
 
 
-def _list_values(effects: Sequence[Named], role: str) -> Iterator[Value]:
+def _list_values(effects: Sequence[Named], role: str) -> Iterator[Number]:
     for effect in effects:
         if find_effect(effect.id).scale_role == role:
             yield from effect.parameters.values()

@@ -1,44 +1,40 @@
-"""Values of effects with intervals (identified, not significant, all), as JSON and text, and findings."""
+"""Values of effects with intervals (identified, not significant, all), and findings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace as replace_fields
 
-from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite, round_digits
+from pipeline.core import NORMAL_95, round_digits
 from pipeline.estimation.driving_need import measure_driven
 from pipeline.estimation.fit import PathFit, find_unlearned, invert
-from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
 from pipeline.estimation.ladder import ModelAssessment
 from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.model_state import ModelState, combine_columns
 from pipeline.models import (
-    Doubt,
     Effect,
+    Interval,
     Late,
     Model,
-    ModelFile,
+    Number,
     Parameter,
     cut_interval,
-    doubt_number,
     is_of_one_run,
     list_effects,
-    stands_at_bound,
 )
 from pipeline.recording import Finding
 from pipeline.results import (
     BREVITY,
     SEARCH_CUT,
     EstimatedNumber,
-    Interval,
     Named,
     RunDiagnosis,
-    Value,
 )
 from pipeline.run import MotionRun
 
@@ -46,67 +42,62 @@ if TYPE_CHECKING:
     from pipeline.core import Budget
     from pipeline.estimation.estimation_data import EstimationData
 
-_CERTAIN: Mapping[str, Doubt] = {}
+_NOTHING: Mapping[str, Number] = {}
+_UNKNOWN = Number(math.nan)
 _PASSES = 2
 """Steps of the estimate of an effect that a model lacks, the noise learned anew after each."""
 
 
 def list_values(
-    effect: Effect, estimates: Estimates | None, doubts: Mapping[str, Doubt] = _CERTAIN
-) -> dict[str, Value]:
+    effect: Effect, estimates: Estimates | None, noted: Mapping[str, Number] = _NOTHING
+) -> dict[str, Number]:
     """Values of an effect with the intervals of a fit, NaN where the fit has none, and their doubts.
 
     Args:
         effect: with its values.
         estimates: of the fit; None without one.
-        doubts: what the driving makes doubtful, by label; see `ModelAssessment.doubts`.
+        noted: what the driving makes doubtful, by label; see `ModelAssessment.numbers`.
     """
-    known = {} if estimates is None else {item.free.label: item for item in estimates.items}
-    values = {}
+    known = {} if estimates is None else {item.free.label: item.number for item in estimates.items}
+    numbers = {}
     for parameter in effect.parameters:
-        value = effect.values[parameter.name]
+        value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
         if not math.isfinite(value):
             continue
-        label = f"{effect.id}.{parameter.name}"
-        item = known.get(label)
-        # As they are written: what is said of a stored answer is what was said of it at first.
-        low, high = (math.nan, math.nan) if item is None else (_write(item.low), _write(item.high))
-        at_bound = stands_at_bound(value, parameter.bounds)
-        own = at_bound or is_of_one_run(effect.parameters)
-        another = Interval() if own else expect_another_run(parameter, value, low, high)
-        doubt = doubt_number(parameter, value, low, high) or doubts.get(label, Doubt())
-        values[parameter.name] = Value(
-            value, low, high, parameter.unit, at_bound, another,
-            is_spread_measured=parameter.between_runs is not None, doubt=doubt.id, stretches=doubt.stretches,
-        )  # fmt: skip
-    return values
+        found, said = known.get(label, _UNKNOWN), noted.get(label, _UNKNOWN)
+        found = replace_fields(found, value=value, doubt=said.doubt, stretches=said.stretches)
+        number = found.doubt_as(parameter)
+        own = number.at_bound or is_of_one_run(effect.parameters)
+        numbers[parameter.name] = replace_fields(
+            number,
+            another_run=Interval() if own else expect_another_run(parameter, number),
+            is_spread_measured=parameter.between_runs is not None,
+        )
+    return numbers
 
 
-def list_first_run(state: ModelState, estimates: Estimates) -> dict[str, dict[str, Value]]:
+def list_first_run(state: ModelState, estimates: Estimates) -> dict[str, dict[str, Number]]:
     """Values of every effect of a fitted state in the first run, by id."""
     first = estimates.choose_run(0)
     return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
 
 
-def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> Interval:
-    """95 % interval of a value in another run on the same ground, NaN where this run has none.
+def expect_another_run(parameter: Parameter, number: Number) -> Interval:
+    """95 % interval of a number in another run on the same ground, NaN where this run has none.
 
     It combines the interval of this run with the spread between runs, observed or typical
     (`Parameter.spread`), as independent errors. The spread applies to both runs: their difference is larger
     by the root of two than the deviation of one run from the ground's mean. It is cut at the search bounds.
     """
+    value, low, high = number.value, number.low, number.high
     if not math.isfinite(high - low):
         return Interval()
     change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
     below, above = math.hypot(value - low, change), math.hypot(high - value, change)
-    return Interval(*map(_write, cut_interval(value - below, value + above, parameter.bounds)))
+    return Interval(*map(round_digits, cut_interval(value - below, value + above, parameter.bounds)))
 
 
-def _write(value: float) -> float:
-    return round_digits(value) if math.isfinite(value) else value
-
-
-def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
+def read_clock(effect: Effect, run: MotionRun) -> dict[str, Number]:
     """Pose delay from a run's gyro, with the error of the gyro fit; fits of the motion do not change it.
 
     Its interval includes the variation of the delay in a run and half a gyro sample, since a stamp may mark
@@ -120,9 +111,8 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
         sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / NORMAL_95
         spread = run.alignment.latency_spread_s
         half = NORMAL_95 * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
-    low, high = value - half - run.repeats_s, value + half
-    another = expect_another_run(parameter, value, low, high)
-    return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}
+    number = Number(value, value - half - run.repeats_s, value + half, parameter.unit)
+    return {parameter.name: replace_fields(number, another_run=expect_another_run(parameter, number))}
 
 
 def list_estimates(
@@ -231,68 +221,6 @@ def _estimate_added(fit: PathFit, effect: Effect) -> list[Estimate]:
     ]
 
 
-def parameters_as_json(
-    model: Model, estimates: Estimates, doubts: Mapping[str, Doubt] = _CERTAIN
-) -> dict[str, dict[str, object]]:
-    """Every parameter by ``effect.name``: value, 95 % interval, unit, doubt, and whether it was fitted."""
-    entries: dict[str, dict[str, object]] = {}
-    for effect in model:
-        for parameter in effect.parameters:
-            value = effect.values[parameter.name]
-            entries[f"{effect.id}.{parameter.name}"] = {
-                "value": _round(value),
-                "low": None,
-                "high": None,
-                "unit": parameter.unit,
-                "fitted": False,
-            }
-    own: dict[str, list[tuple[int, dict[str, object]]]] = {}
-    for item in estimates.items:
-        if not item.free.effect:
-            continue
-        label = item.free.label
-        entry: dict[str, object] = {
-            **pick_finite(item, "value", "low", "high", digits=JSON_DIGITS),
-            "unit": item.free.unit,
-            "fitted": True,
-            "at_bound": item.at_bound,
-            "observable": item.observable,
-        }
-        if item.free.runs:
-            own.setdefault(label, []).extend((run, entry) for run in item.free.runs)
-        else:
-            entries[label] = entry
-    for label, rows in own.items():
-        ordered = sorted(rows, key=lambda one: one[0])
-        entries[label] |= {"fitted": True, "runs": [{"run": run, **entry} for run, entry in ordered]}
-    for label in entries.keys() & doubts.keys():
-        entries[label] |= {"doubt": doubts[label].id, "doubt_text": doubts[label].reason}
-    return entries
-
-
-def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
-    """Every parameter of a model file by ``effect.name``: intervals of its last fit, and doubts."""
-    parameters = parameters_as_json(file.model, NOT_FITTED, file.list_doubts())
-    for label, (low, high) in file.intervals.items():
-        parameters[label] |= {"low": _round(low), "high": _round(high)}
-    for row in file.own_numbers:
-        if (label := str(row.get("parameter"))) in parameters:
-            cast("list[object]", parameters[label].setdefault("runs", [])).append(row)
-    return parameters
-
-
-def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
-    """Pairs of parameters that the data hardly distinguish."""
-    return [
-        {"parameters": [one.label, other.label], "correlation": _round(value)}
-        for one, other, value in estimates.list_correlated()
-    ]
-
-
-def _round(value: float) -> float | None:
-    return finite_or_none(value, JSON_DIGITS)
-
-
 def was_aligned(effect: Effect, data: EstimationData) -> bool:
     """Whether an effect is a clock offset that the gyro corrected before any model was fitted."""
     return effect.late is Late.POSES and data.has_gyro
@@ -300,7 +228,7 @@ def was_aligned(effect: Effect, data: EstimationData) -> bool:
 
 def list_by_run(
     effect: Effect, data: EstimationData, assessment: ModelAssessment | None
-) -> tuple[dict[str, Value], ...]:
+) -> tuple[dict[str, Number], ...]:
     """Values of an effect: by run where runs or grounds have their own, else once."""
     if was_aligned(effect, data):
         delays = [run.alignment.heading_delay_s for run in data.runs]
@@ -313,7 +241,7 @@ def list_by_run(
         return (list_values(effect, None),)
     acting = assessment.fitted.state.list_as_it_acts(assessment.fitted.model.effect(effect.id))
     by_run = [
-        list_values(one, assessment.estimates.choose_run(run), assessment.doubts)
+        list_values(one, assessment.estimates.choose_run(run), assessment.numbers)
         for run, one in enumerate(acting)
     ]
     if effect.late is Late.POSES:

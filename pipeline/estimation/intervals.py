@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import NORMAL_95
+from pipeline.core import NORMAL_95, round_digits
 from pipeline.estimation.fit import invert, join_covariance, measure_cost, whiten_columns
 from pipeline.estimation.path_residuals import CLOCK_STEP_S
-from pipeline.models import cut_interval, stands_at_bound
+from pipeline.models import Number, cut_interval, stands_at_bound
 
 if TYPE_CHECKING:
     from pipeline.core import Floats
@@ -60,6 +60,12 @@ class Estimate:
         return cut_interval(self.value - self.half, self.value + self.half, bounds)
 
     @property
+    def number(self) -> Number:
+        """It as a number: what is said of a stored answer is what was said of it at first."""
+        low, high = map(round_digits, self.interval)
+        return Number(self.value, low, high, self.free.unit, self.at_bound)
+
+    @property
     def low(self) -> float:
         """Lower end of the interval."""
         return self.interval[0]
@@ -95,10 +101,10 @@ class Estimates:
         return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
 
     @property
-    def shared_intervals(self) -> dict[str, tuple[float, float]]:
-        """Finite intervals of the effects' parameters that all runs share, by label."""
+    def numbers(self) -> dict[str, Number]:
+        """The numbers of the effects that all runs share and the data determine, by label."""
         return {
-            item.free.label: item.interval
+            item.free.label: item.number
             for item in self.items
             if item.free.effect and not item.free.runs and math.isfinite(item.low)
         }

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.core import Floats, pick
-from pipeline.estimation.driving_need import find_doubts
+from pipeline.estimation.driving_need import list_numbers
 from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.floor import estimate_floor
@@ -20,7 +20,7 @@ from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
-from pipeline.models import Doubt, Model, ModelFile, Timing
+from pipeline.models import Model, ModelFile, Number, Timing
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, Step, as_written, list_rises, to_json
 from pipeline.run import STILL_MPS
 
@@ -244,10 +244,10 @@ class ModelAssessment:
         return self.whole.fitted
 
     @cached_property
-    def doubts(self) -> dict[str, Doubt]:
-        """What the driving makes doubtful of its parameters, by label; nothing where a fleet adds to it."""
+    def numbers(self) -> dict[str, Number]:
+        """Its numbers by label with what the driving makes doubtful; nothing is where a fleet adds to it."""
         has_prior = any(path.prior.numbers for path in self.data.paths)
-        return {} if has_prior else find_doubts(self.data, self.fitted)
+        return self.estimates.numbers if has_prior else list_numbers(self.data, self.fitted, self.estimates)
 
     @cached_property
     def floor(self) -> Errors:
@@ -274,17 +274,8 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     """
     fitted = assessment.fitted.model
     model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
-    intervals = {
-        label: interval
-        for label, interval in file.intervals.items()
-        if not any(label.startswith(f"{effect.id}.") for effect in fitted)
-    }
+    kept = {label: one for label, one in file.numbers.items() if label.partition(".")[0] not in fitted.ids}
     data, estimates = assessment.data, assessment.estimates
-    intervals |= estimates.shared_intervals
-    doubts = {
-        label: doubt for label, doubt in file.doubts.items() if label.partition(".")[0] not in fitted.ids
-    }
-    doubts |= assessment.doubts
     fit: dict[str, object] = {
         "input": data.source.value,
         "blocks": estimates.blocks,
@@ -331,7 +322,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
         ids = set(model.ids)
         undecided = [group for group in file.undecided if ids.intersection(group)]
         fit |= {key: rows for key, rows in (("undecided", undecided),) if rows}
-    return replace(file, model=model, per_run=per_run, intervals=intervals, doubts=doubts, fit=fit)
+    return replace(file, model=model, per_run=per_run, numbers=kept | assessment.numbers, fit=fit)
 
 
 def _measure_driven(data: EstimationData) -> list[dict[str, float]]:

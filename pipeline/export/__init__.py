@@ -20,11 +20,11 @@ from typing import Any, TypeAlias
 from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
 from pipeline.models import (
     UNDECIDED,
-    Doubt,
     Effect,
     FormulaEffect,
     Model,
     ModelFile,
+    Number,
     Parameter,
     Quantity,
     is_own,
@@ -208,13 +208,13 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
     return (target.write or write_yaml)(facts, table)
 
 
-def list_omitted(file: ModelFile, name: str) -> Mapping[str, Doubt]:
+def list_omitted(file: ModelFile, name: str) -> Mapping[str, Number]:
     """Values in doubt, by label, whose parameters a target leaves out, or has as comments only.
 
     Raises:
         MotionError: ``unknown_target``.
     """
-    return {} if find_target(name).takes_doubtful else file.list_doubts()
+    return {} if find_target(name).takes_doubtful else file.list_doubtful()
 
 
 def _fill_row(row: Row, facts: Facts, table: ParameterTable, current: Current) -> None:
@@ -405,7 +405,7 @@ class Facts:
         values, sources, effects, is_doubtful = [], [], [], False
         for effect, parameter in self._list_numbers():
             if quantity in parameter.quantities:
-                is_doubtful |= bool(self.file.find_doubt(effect, parameter))
+                is_doubtful |= bool(self.file.find_number(effect, parameter).doubt)
                 values.append(effect.values[parameter.name])
                 sources.append(self._format_source(effect, parameter))
                 effects.append(effect.id)
@@ -415,9 +415,9 @@ class Facts:
         """Variance of a quantity whose values add up, from their intervals; unknown if one has none."""
         taken, variances = self.take(quantity), list[float]()
         for effect, parameter in self._list_numbers():
-            interval = self.file.intervals.get(f"{effect.id}.{parameter.name}")
-            if effect.id in taken.effects and quantity in parameter.quantities and interval is not None:
-                variances.append((0.5 * (interval[1] - interval[0]) / NORMAL_95) ** 2)
+            number = self.file.find_number(effect, parameter)
+            if effect.id in taken.effects and quantity in parameter.quantities and math.isfinite(number.low):
+                variances.append((0.5 * (number.high - number.low) / NORMAL_95) ** 2)
         value = math.fsum(variances) if len(variances) == len(taken.effects) else math.nan
         return replace(taken, value=value)
 
@@ -565,27 +565,20 @@ class Facts:
                 yield from ((effect, parameter) for parameter in effect.parameters)
 
     def _format_source(self, effect: Effect, parameter: Parameter) -> str:
-        label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
-        unit = suffix_unit(parameter.unit)
-        text = f"{label} = {value:.5g}{unit}"
-        if label in self.file.intervals:
-            low, high = self.file.intervals[label]
-            text += f" (95 %: {low:.5g} to {high:.5g})"
+        label, number = f"{effect.id}.{parameter.name}", self.file.find_number(effect, parameter)
+        text = f"{label} = {number.value:.5g}{suffix_unit(number.unit)}"
+        if math.isfinite(number.low):
+            text += f" (95 %: {number.low:.5g} to {number.high:.5g})"
         if by_ground := self._list_by_ground(label):
             text += f", the mean of {', '.join(by_ground)}"
-        doubt = self.file.find_doubt(effect, parameter)
-        if doubt.id == UNDECIDED:
+        if number.doubt == UNDECIDED:
             names = " or ".join(map(quote_name, self.file.list_rivals(effect.id)))
             return f"{text}, undecided: {names} would explain the data as well"
-        return f"{text}, {doubt.reason}" if doubt else text
+        return f"{text}, {number.reason}" if number.doubt else text
 
     def _list_by_ground(self, label: str) -> list[str]:
         """Values of a parameter that grounds or runs have of their own; of many the least and the largest."""
-        by_run = {
-            str(row.get("run")): value
-            for row in self.file.own_numbers
-            if row.get("parameter") == label and isinstance(value := row.get("value"), float)
-        }
+        by_run = {run: number.value for run, number in self.file.list_own().get(label, {}).items()}
         grounds = {str(row.get("run")): str(row.get("terrain")) for row in self.file.list_fitted("runs")}
         values = {(grounds.get(run, run), value) for run, value in by_run.items()}
         if len(values) != len({ground for ground, _ in values}) or {"None", "unknown"} & {*dict(values)}:

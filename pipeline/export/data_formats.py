@@ -6,40 +6,32 @@ from collections.abc import Mapping
 from datetime import date, time
 from types import MappingProxyType
 
-from pipeline.core import finite_or_none, pick
+from pipeline.core import pick
 from pipeline.export import Target
-from pipeline.models import Doubt, FormulaEffect, ModelFile
+from pipeline.models import FormulaEffect, ModelFile, Number
 
 _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track_multiplier")
 
 
 def write_json_object(file: ModelFile) -> str:
     """Write the model without the values in doubt, which are listed with their reasons."""
-    return dump_model(file, file.list_doubts())
+    return dump_model(file, file.list_doubtful())
 
 
-def dump_model(file: ModelFile, omitted: Mapping[str, Doubt] = MappingProxyType({})) -> str:
+def dump_model(file: ModelFile, omitted: Mapping[str, Number] = MappingProxyType({})) -> str:
     """The model as JSON with values, intervals and units; numbers that are not finite become null.
 
     Args:
         file: the model.
-        omitted: doubts about values to leave out, by label.
+        omitted: the values in doubt to leave out, by label.
     """
     vehicle = file.model.vehicle
-    effects = []
+    effects, numbers = [], file.list_numbers()
     for effect in file.model:
-        parameters = {}
-        for parameter in effect.parameters:
-            if f"{effect.id}.{parameter.name}" in omitted:
-                continue
-            low, high = file.intervals.get(f"{effect.id}.{parameter.name}", (math.nan, math.nan))
-            one = file.find_doubt(effect, parameter)
-            numbers = {"value": effect.values[parameter.name], "low": low, "high": high}
-            parameters[parameter.name] = {
-                **{key: finite_or_none(number) for key, number in numbers.items()},
-                "unit": parameter.unit,
-                **({"doubt": one.id, "doubt_text": one.reason} if one else {}),
-            }
+        labels = {parameter.name: f"{effect.id}.{parameter.name}" for parameter in effect.parameters}
+        parameters = {
+            name: numbers[label].to_json() for name, label in labels.items() if label not in omitted
+        }
         item: dict[str, object] = {
             "id": effect.id,
             "place": effect.place.name.lower(),
@@ -58,7 +50,7 @@ def dump_model(file: ModelFile, omitted: Mapping[str, Doubt] = MappingProxyType(
         },
         "effects": effects,
         "fit": _plain(file.fit),
-        **({"omitted": {label: doubt.reason for label, doubt in omitted.items()}} if omitted else {}),
+        **({"omitted": {label: number.reason for label, number in omitted.items()}} if omitted else {}),
         **({"warnings": warnings} if warnings else {}),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"

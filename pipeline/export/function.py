@@ -79,7 +79,9 @@ def write_function(model: Model) -> str:
 def _write_file(file: ModelFile) -> str:
     """The function with the doubts about its values as comments above it."""
     head, _, rest = write_function(file.model).partition("\n\n")
-    doubts = "".join(f"# In doubt: {label}: {doubt.reason}.\n" for label, doubt in file.list_doubts().items())
+    doubts = "".join(
+        f"# In doubt: {label}: {number.reason}.\n" for label, number in file.list_doubtful().items()
+    )
     return f"{head}\n\n{doubts}{rest}"
 
 

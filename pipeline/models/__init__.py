@@ -9,7 +9,6 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.models.catalogue import *
-    from pipeline.models.doubt import *
     from pipeline.models.effect import *
     from pipeline.models.expression import *
     from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written, list_terms
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from pipeline.models.model import *
     from pipeline.models.model_file import *
     from pipeline.models.model_text import *
+    from pipeline.models.number import *
     from pipeline.models.parameter import *
 else:
     __getattr__ = open_door(
@@ -38,16 +38,6 @@ else:
                 "name_term",
                 "refuse_taken",
                 "suggest_manoeuvre",
-            ),
-            "doubt": (
-                "AT_BOUND",
-                "FEWEST_STRETCHES",
-                "FEW_STRETCHES",
-                "ONE_LIMIT",
-                "TOO_SHORT",
-                "UNDECIDED",
-                "Doubt",
-                "doubt_number",
             ),
             "effect": (
                 "ANY",
@@ -97,6 +87,18 @@ else:
                 "format_value",
                 "write_model",
                 "write_text",
+            ),
+            "number": (
+                "AT_BOUND",
+                "FEWEST_STRETCHES",
+                "FEW_STRETCHES",
+                "ONE_LIMIT",
+                "TOO_SHORT",
+                "UNDECIDED",
+                "DOUBTS",
+                "Interval",
+                "Number",
+                "split_determined",
             ),
             "parameter": (
                 "EXCEEDED_SHARE",

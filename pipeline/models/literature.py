@@ -18,7 +18,7 @@ from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 
 
-class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Constant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A parameter or constant of a formula.
 
     Attributes:
@@ -61,7 +61,7 @@ class LiteratureModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kinds: tuple[str, ...] = ("differential",)
     effects: tuple[str, ...] = ()
     terms: dict[str, str] = {}
-    numbers: dict[str, Number] = {}
+    numbers: dict[str, Constant] = {}
     needs: str = ""
     name: str = ""
 
@@ -87,7 +87,7 @@ class LiteratureModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return vehicle.kind in self.kinds and on_wheels and all(getattr(vehicle, name) for name in taken)
 
     def count_numbers(self) -> int:
-        """Number of parameters that a fit estimates."""
+        """Constant of parameters that a fit estimates."""
         return sum(len(effect.values) - len(effect.fixed) for effect in self._make_effects(None))
 
     def _make_effects(self, vehicle: Vehicle | None) -> tuple[Effect, ...]:

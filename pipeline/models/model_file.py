@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, shorten
+from msgspec.structs import replace
+
+from pipeline.core import SlipError, TomlError, number_in, parse_toml, read_bounded_text, shorten
 from pipeline.models.catalogue import find_effect, refuse_taken
-from pipeline.models.doubt import UNDECIDED, Doubt, doubt_number
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
+from pipeline.models.number import DOUBTS, UNDECIDED, Number
 from pipeline.models.parameter import Parameter
 from pipeline.run import MotionError
 from pipeline.sources import (
@@ -34,6 +36,8 @@ _ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
 Table = dict[str, object]
 
+_UNKNOWN = Number(math.nan)
+
 
 class _VehicleTable(VehicleSection, frozen=True, kw_only=True):
     """``[vehicle]`` of a model file, which also says what is not known of the vehicle."""
@@ -48,16 +52,15 @@ class ModelFile:
     Attributes:
         model: vehicle and effects with their values.
         per_run: labels ``effect.name`` whose values are estimated per run.
-        intervals: 95 % intervals of the last fit by label.
-        doubts: what the runs of the last fit make doubtful, by label; see `find_doubt` for all doubts.
+        numbers: by label what the last fit found: intervals, and what its runs make doubtful. The values
+            are those of the model, and `find_number` knows all doubts.
         fit: record of the last fit: input, runs with hashes, delays, ladder; empty before the first fit.
         note: free text.
     """
 
     model: Model
     per_run: tuple[str, ...] = ()
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    doubts: Mapping[str, Doubt] = field(default_factory=dict)
+    numbers: Mapping[str, Number] = field(default_factory=dict)
     fit: Mapping[str, object] = field(default_factory=dict)
     note: str = ""
 
@@ -78,28 +81,39 @@ class ModelFile:
         """Ids of effects that explained the fitted runs as well as an effect of the model."""
         return [name for group in self.undecided if effect in group for name in group if name != effect]
 
-    def find_doubt(self, effect: Effect, parameter: Parameter) -> Doubt:
-        """The gravest doubt about a value: that of its numbers, its effect, or the runs of the fit.
+    def find_number(self, effect: Effect, parameter: Parameter) -> Number:
+        """A value with its interval and its gravest doubt: that it shows, of its effect, or of the runs.
 
         A value that is fixed is the user's own. In a fitted model another one is undetermined without an
         interval.
         """
         value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
+        noted = replace(self.numbers.get(label, _UNKNOWN), value=value, unit=parameter.unit)
         if value == parameter.neutral or not math.isfinite(value) or parameter.name in effect.fixed:
-            return Doubt()
+            return replace(noted, doubt="", stretches=0)
+        if self.list_rivals(effect.id):
+            noted = replace(noted, doubt=UNDECIDED, stretches=0)
         alone = {*self.per_run, *(row.get("parameter") for row in self.list_fitted("own"))}
-        interval = self.intervals.get(label)
-        if interval is None and (not self.list_fitted("runs") or not alone.isdisjoint({label, effect.id})):
+        ends = noted.low, noted.high
+        if math.isnan(noted.low) and (
+            not self.list_fitted("runs") or not alone.isdisjoint({label, effect.id})
+        ):
             # Nobody fitted it, or each run has its own.
-            interval = (value, value)
-        own = doubt_number(parameter, value, *(interval or (math.nan, math.nan)))
-        return own or Doubt(UNDECIDED if self.list_rivals(effect.id) else "") or self.doubts.get(label, own)
+            ends = value, value
+        number = replace(noted, low=ends[0], high=ends[1]).doubt_as(parameter)
+        return replace(number, low=noted.low, high=noted.high)
 
-    def list_doubts(self) -> dict[str, Doubt]:
-        """Doubts about values by label ``effect.name``; see `find_doubt`."""
-        numbers = ((effect, parameter) for effect in self.model for parameter in effect.parameters)
-        doubts = {f"{effect.id}.{one.name}": self.find_doubt(effect, one) for effect, one in numbers}
-        return {label: doubt for label, doubt in doubts.items() if doubt}
+    def list_numbers(self) -> dict[str, Number]:
+        """All numbers of the model by label ``effect.name``; see `find_number`."""
+        return {
+            f"{effect.id}.{parameter.name}": self.find_number(effect, parameter)
+            for effect in self.model
+            for parameter in effect.parameters
+        }
+
+    def list_doubtful(self) -> dict[str, Number]:
+        """The numbers that are in doubt, by label."""
+        return {label: number for label, number in self.list_numbers().items() if number.doubt}
 
     def list_fitted(self, key: str) -> list[dict[str, object]]:
         """Tables of a name in the last fit, such as `runs` or `own`; empty before the first fit."""
@@ -111,18 +125,23 @@ class ModelFile:
         delays = (row.get("wheel_delay_s") for row in self.list_fitted("runs") if row.get("run") == run)
         return next((late for late in delays if isinstance(late, float)), 0.0)
 
-    @property
-    def own_numbers(self) -> list[dict[str, object]]:
-        """Values estimated per run in the last fit: `run`, `parameter`, `value`, `low`, `high`."""
-        return self.list_fitted("own")
+    def list_own(self) -> dict[str, dict[str, Number]]:
+        """Numbers that runs of the last fit have of their own: by label, then by run."""
+        own: dict[str, dict[str, Number]] = {}
+        for row in self.list_fitted("own"):
+            label, value = str(row.get("parameter")), number_in(row, "value")
+            effect, _, name = label.partition(".")
+            if value is None or effect not in self.model:
+                continue
+            parameter = self.model.effect(effect).parameter(name)
+            low, high = (number_in(row, end) for end in ("low", "high"))
+            ends = (math.nan, math.nan) if low is None or high is None else (low, high)
+            own.setdefault(label, {})[str(row.get("run"))] = Number(value, *ends).doubt_as(parameter)
+        return own
 
     def find_effects(self, run: str) -> tuple[Effect, ...]:
         """The effects with the values estimated for one run in the last fit."""
-        own = {
-            row.get("parameter"): value
-            for row in self.own_numbers
-            if row.get("run") == run and isinstance(value := row.get("value"), float)
-        }
+        own = {label: one[run].value for label, one in self.list_own().items() if run in one}
         return tuple(
             effect.change(**{n: own[label] for n in effect.values if (label := f"{effect.id}.{n}") in own})
             for effect in self.model
@@ -189,8 +208,7 @@ class _Reader:
                 "model_not_toml", error.what, where=str(where), hint="Correct that line."
             ) from None
         self.per_run: list[str] = []
-        self.intervals: dict[str, tuple[float, float]] = {}
-        self.doubts: dict[str, Doubt] = {}
+        self.numbers: dict[str, Number] = {}
 
     def read(self) -> ModelFile:
         """Parse the whole file."""
@@ -209,8 +227,7 @@ class _Reader:
         return ModelFile(
             model=Model(vehicle, tuple(self._list_effects(vehicle))),
             per_run=tuple(self.per_run),
-            intervals=self.intervals,
-            doubts=self.doubts,
+            numbers=self.numbers,
             fit=fit if isinstance(fit, dict) else {},
             note=str(self.tree.get("note", "")),
         )
@@ -355,14 +372,15 @@ class _Reader:
             if not low <= high:
                 what = f"low = {low:g} of {label} is above its high = {high:g}"
                 raise self._error(what, "Exchange them, or fit the model again.", at, key)
-            self.intervals[label] = (low, high)
+            self.numbers[label] = Number(math.nan, low, high)
         if "doubt" in raw:
-            count = raw.get("stretches", 0)
-            doubt = Doubt(str(raw["doubt"]), count if isinstance(count, int) else 0)
-            if not doubt.is_known:
-                what = f"the doubt {doubt.id!r} about {label} is not known"
+            count, said = raw.get("stretches", 0), str(raw["doubt"])
+            if said not in DOUBTS:
+                what = f"the doubt {said!r} about {label} is not known"
                 raise self._error(what, "Omit it, or fit the model again.", at, key)
-            self.doubts[label] = doubt
+            noted = self.numbers.get(label, _UNKNOWN)
+            stretches = count if isinstance(count, int) else 0
+            self.numbers[label] = replace(noted, doubt=said, stretches=stretches)
         value = raw.get("value")
         if value is not None and not _is_number(value):
             raise self._error(f"the value of {label} is not a number", "Write value = 1.5.", at, key)

@@ -9,13 +9,13 @@ import tomlkit
 
 from pipeline.core import naming_os_errors, round_digits
 from pipeline.logs.index import SUFFIXES, stem_of
-from pipeline.models.doubt import Doubt
 from pipeline.models.effect import (
     Effect,
     Parameter,
 )
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import FORMAT, ModelFile
+from pipeline.models.number import Number
 from pipeline.run import MotionError
 from pipeline.sources import FLEET_FILE, RANGES, RUN_FILE, Vehicle, find_preset, is_model
 from pipeline.store import replace_file
@@ -111,9 +111,9 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
 def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | None) -> str:
     label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
     parts = [] if math.isnan(value) else [f"value = {_exactly(parameter.round(value))}"]
-    if file is not None and label in file.intervals:
-        low, high = file.intervals[label]
-        parts += [f"low = {format_value(low)}", f"high = {format_value(high)}"]
+    noted = (file and file.numbers.get(label)) or Number(value)
+    if math.isfinite(noted.low):
+        parts += [f"low = {format_value(noted.low)}", f"high = {format_value(noted.high)}"]
     parts.append(f"unit = {format_value(parameter.unit)}")
     if isinstance(effect, FormulaEffect):
         parts.append(f"bounds = [{', '.join(map(_exactly, parameter.bounds))}]")
@@ -123,11 +123,10 @@ def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | No
         parts.append("fixed = true")
     if file is not None and not {label, effect.id}.isdisjoint(file.per_run):
         parts.append("per_run = true")
-    noted = Doubt() if file is None else file.doubts.get(label, Doubt())
-    parts += [f"doubt = {format_value(noted.id)}"] * bool(noted)
+    parts += [f"doubt = {format_value(noted.doubt)}"] * bool(noted.doubt)
     parts += [f"stretches = {noted.stretches}"] * bool(noted.stretches)
-    said = Doubt() if file is None else file.find_doubt(effect.rounded, parameter)
-    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}" + (f"  # {said.reason}" if said else "")
+    reason = "" if file is None else file.find_number(effect.rounded, parameter).reason
+    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}" + (f"  # {reason}" if reason else "")
 
 
 def _format_table(name: str, table: Mapping[str, object]) -> list[str]:

@@ -16,7 +16,7 @@ from pipeline.core import (
     objects_in,
     split_interval,
 )
-from pipeline.models import Doubt, list_effects, name_term, suggest_manoeuvre
+from pipeline.models import list_effects, name_term, suggest_manoeuvre
 from pipeline.recording import Finding
 from pipeline.report import (
     MISSING,
@@ -440,12 +440,11 @@ def _list_parameters(effect: Named) -> list[list[str | Cell]]:
     rows: list[list[str | Cell]] = []
     for key, value in effect.parameters.items():
         shown = "" if value.unit in {"1", ""} else set_squares(value.unit)
-        doubts = [mark] if (mark := Doubt(value.doubt, value.stretches).mark) else []
         text, ends = _format_within(value.value, value.low, value.high)
         rows.append(
             [
                 Cell(small=key) if rows else Cell(effect.id, small=key, notes=notes),
-                Cell(text, small=shown, notes=doubts),
+                Cell(text, small=shown, notes=[value.mark] if value.doubt else []),
                 ends,
                 _format_within(value.value, value.another_run.low, value.another_run.high)[1],
                 "" if rows else without,

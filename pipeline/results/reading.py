@@ -9,9 +9,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar, cast
 
-from pipeline.core import JSON_DIGITS, format_share, mapping_in, number_in, objects_in, round_digits
+from pipeline.core import (
+    JSON_DIGITS,
+    format_share,
+    mapping_in,
+    number_in,
+    objects_in,
+    round_digits,
+    round_numbers,
+)
 from pipeline.recording import FAULTS, Finding
-from pipeline.results.structs import Errors, RunDiagnosis, Step, round_numbers
+from pipeline.results.structs import Errors, RunDiagnosis, Step
 from pipeline.run import GROUND_UNOBSERVABLE
 
 if TYPE_CHECKING:

@@ -10,72 +10,14 @@ from typing import TypeVar, cast
 import msgspec
 from msgspec.structs import replace
 
-from pipeline.core import JSON_DIGITS, count_places, finite_or_none
-from pipeline.models import ONE_LIMIT
+from pipeline.core import round_numbers
+from pipeline.models import Number, split_determined
 from pipeline.recording import Finding
 from pipeline.sources import Vehicle
 from pipeline.store import convert_stored
 
 Result = TypeVar("Result", bound=msgspec.Struct)
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
-
-
-class Interval(msgspec.Struct, frozen=True):
-    """An interval; NaN where there is none."""
-
-    low: float = math.nan
-    high: float = math.nan
-
-
-class Value(msgspec.Struct, frozen=True):
-    """A value with its 95 % interval, NaN where there is none, and whether it is at its bound.
-
-    `another_run`: expected interval in another run on this ground. `is_spread_measured`: whether the spread
-    between runs was measured, not only assumed. `doubt`: why it is not to be used as it stands, the id of a
-    `pipeline.models.Doubt`; empty without one. `stretches`: how many stretches it rests on, where few.
-    """
-
-    value: float
-    low: float = math.nan
-    high: float = math.nan
-    unit: str = "1"
-    at_bound: bool = False
-    another_run: Interval = Interval()
-    is_spread_measured: bool = False
-    doubt: str = ""
-    stretches: int = 0
-
-    @property
-    def is_undetermined(self) -> bool:
-        """Whether the runs do not determine it: no finite interval, one limit only, or at its bound."""
-        return self.at_bound or self.doubt == ONE_LIMIT or not math.isfinite(self.high - self.low)
-
-    @property
-    def half(self) -> float:
-        """The wider half of its interval: the other half may be cut at a bound of the parameter."""
-        return max(self.high - self.value, self.value - self.low)
-
-    @property
-    def digits(self) -> int:
-        """Significant digits that its interval supports, at least one; as in JSON where it has none."""
-        if not self.value or not 0.0 < self.half < math.inf:
-            return JSON_DIGITS
-        places = count_places(self.half)
-        return min(max(math.floor(math.log10(abs(self.value))) + places + 1, 1), JSON_DIGITS)
-
-    def move(self, change: float) -> Value:
-        """The value and its intervals shifted by a known amount."""
-        there = self.another_run
-        return replace(
-            self, value=self.value + change, low=self.low + change, high=self.high + change,
-            another_run=Interval(there.low + change, there.high + change),
-        )  # fmt: skip
-
-
-def split_determined(numbers: Mapping[str, Value]) -> tuple[dict[str, Value], dict[str, Value]]:
-    """Values that the runs determine, and those that they leave open or that are at a bound."""
-    known = {name: value for name, value in numbers.items() if not value.is_undetermined}
-    return known, {name: value for name, value in numbers.items() if name not in known}
 
 
 class Moves(msgspec.Struct, frozen=True):
@@ -137,7 +79,7 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     """
 
     id: str
-    parameters: dict[str, Value] = {}
+    parameters: dict[str, Number] = {}
     gain: float = math.nan
     equivalent_to: tuple[str, ...] = ()
     confused_with: tuple[str, ...] = ()
@@ -146,7 +88,7 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     selection_frequency: float = math.nan
     moves: Moves | None = None
     growth: Growth | None = None
-    by_run: tuple[dict[str, Value], ...] = ()
+    by_run: tuple[dict[str, Number], ...] = ()
 
     @property
     def is_determined(self) -> bool:
@@ -162,7 +104,7 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
         }
 
     @property
-    def shown(self) -> Mapping[str, Value]:
+    def shown(self) -> Mapping[str, Number]:
         """The values that the runs determine; all those of a corrected clock."""
         return self.parameters if self.corrected else split_determined(self.parameters)[0]
 
@@ -201,7 +143,7 @@ class Undecided(msgspec.Struct, frozen=True):
     """
 
     candidates: tuple[str, ...]
-    parameters: dict[str, dict[str, Value]] = {}
+    parameters: dict[str, dict[str, Number]] = {}
     in_model: str | None = None
 
 
@@ -566,15 +508,6 @@ _NUMBERS = frozenset(
 def to_json(result: msgspec.Struct) -> dict[str, Json]:
     """A result as JSON: six digits, null for what is not known."""
     return cast("dict[str, Json]", round_numbers(msgspec.to_builtins(result)))
-
-
-def round_numbers(value: object, digits: int | None = JSON_DIGITS) -> object:
-    """An object with numbers of so many digits, by default of JSON; None for those that are not finite."""
-    if isinstance(value, float):
-        return finite_or_none(value, digits)
-    if isinstance(value, dict):
-        return {key: round_numbers(one, digits) for key, one in value.items()}
-    return [round_numbers(one, digits) for one in value] if isinstance(value, list | tuple) else value
 
 
 def read_result(content: Mapping[str, object], kind: type[Result], where: Path = Path()) -> Result:

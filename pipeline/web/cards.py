@@ -6,17 +6,16 @@ import re
 from pipeline.core import split_interval
 from pipeline.estimation.additions import Addition
 from pipeline.models import (
-    Doubt,
     Effect,
     FormulaEffect,
     Model,
+    Number,
     Parameter,
     list_effects,
     list_own_effects,
     make_parameter,
     name_effect,
     refuse_taken,
-    stands_at_bound,
 )
 from pipeline.results import Errors
 from pipeline.sources import Vehicle
@@ -72,28 +71,22 @@ def _summarize(effect: Effect | type[Effect]) -> str:
 
 
 def show_parameter(
-    effect: Effect,
-    parameter: Parameter,
-    interval: tuple[float, float] | None,
-    doubt: Doubt,
-    *,
-    is_fitted: bool,
+    effect: Effect, parameter: Parameter, number: Number, *, is_fitted: bool
 ) -> dict[str, object]:
     """A parameter as a slider.
 
     Args:
         effect: with its values.
         parameter: of the effect.
-        interval: 95 % interval; None without one.
-        doubt: why the value is not to be used as it stands.
+        number: its value, with interval and doubt.
         is_fitted: whether the value comes from a fit.
     """
-    value = effect.values[parameter.name]
+    value, is_determined = number.value, math.isfinite(number.low)
     # What is usual for a parameter of somebody's formula is not known: its value says how large it is.
     is_measure = isinstance(effect, FormulaEffect) and value != parameter.neutral
     low, high = _find_range(parameter, value, value if is_measure else parameter.typical)
     # With the digits that the interval supports, as on the screen.
-    said, *ends = split_interval(value, *interval) if interval else ("",)
+    said, *ends = split_interval(value, number.low, number.high) if is_determined else ("",)
     return {
         "name": parameter.name,
         "unit": parameter.unit,
@@ -104,10 +97,10 @@ def show_parameter(
         "from": low,
         "to": high,
         "step": (high - low) / _STEPS,
-        "doubt": doubt.reason,
-        "at_bound": value != parameter.neutral and stands_at_bound(value, parameter.bounds),
+        "doubt": number.reason,
+        "at_bound": number.at_bound,
         "locked": parameter.name in effect.fixed,
-        "undetermined": is_fitted and interval is None and parameter.name not in effect.fixed,
+        "undetermined": is_fitted and not is_determined and parameter.name not in effect.fixed,
     }
 
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from pipeline.estimation.additions import explain_refusals, list_beyond, weigh_addition
-from pipeline.estimation.driving_need import find_doubts
-from pipeline.models import Doubt, Effect, Model, ModelFile, find_effect, name_term
+from pipeline.estimation.driving_need import list_numbers
+from pipeline.models import Effect, Model, ModelFile, Number, find_effect, name_term
 from pipeline.results import Errors, RunDiagnosis, Step, read_diagnosed, read_model
 from pipeline.web import WorkbenchError
 from pipeline.web.cards import show_addition
 from pipeline.web.figures import Shown
-from pipeline.web.prepared import PreparedRun
+from pipeline.web.prepared import FittedModel, PreparedRun
 from pipeline.words import format_refusals
 
 _MOST_STEPS = 200
@@ -28,8 +28,7 @@ class Edit:
         said: short text of the action.
         model: the model.
         order: ids of its effects in the order in which they were added.
-        intervals: 95 % intervals by label ``effect.parameter``.
-        doubts: what the driving makes doubtful of the fitted values, by label.
+        numbers: of the last fit by label ``effect.parameter``, with what the driving makes doubtful.
         wheel_delay_s: delay of the recorded wheels [s].
         ladder: from the ideal model upwards.
         without: error over 2 s without one effect [m], by id.
@@ -40,8 +39,7 @@ class Edit:
     said: str
     model: Model
     order: tuple[str, ...] = ()
-    intervals: Mapping[str, tuple[float, float]]
-    doubts: Mapping[str, Doubt]
+    numbers: Mapping[str, Number]
     wheel_delay_s: float = 0.0
     ladder: tuple[Step, ...] = ()
     without: Mapping[str, float]
@@ -158,8 +156,7 @@ class Session:
             said=f"{name}: {parameter} = {value:.4g}",
             model=model,
             ladder=(*step.ladder[:-1], self._measure(step.ladder[-1].effects, errors)),
-            intervals={} if known is None else known.estimates.shared_intervals,
-            doubts={} if known is None else find_doubts(self.prepared.data, known.step.fitted),
+            numbers={} if known is None else self._list_numbers(known),
             by_hand=known is None,
         )
         return self._push(changed)
@@ -178,9 +175,12 @@ class Session:
 
     def format_file(self) -> ModelFile:
         """The model as it is saved: with the data of its fit, unless values were set by hand since."""
-        file = ModelFile(self.step.model, intervals=self.step.intervals)
+        file = ModelFile(self.step.model, numbers=self.step.numbers)
         is_fitted = file.model.effects and not self.step.by_hand
         return self.prepared.note_fit(file) if is_fitted else file
+
+    def _list_numbers(self, judged: FittedModel) -> dict[str, Number]:
+        return list_numbers(self.prepared.data, judged.step.fitted, judged.estimates)
 
     def _push(self, step: Edit) -> Session:
         steps = (*self.steps[: self.at + 1], step)[-_MOST_STEPS:]
@@ -212,8 +212,7 @@ class Session:
             said=said,
             model=model.swap(*(one.rounded for one in fitted)),
             order=tuple(order),
-            intervals=judged.estimates.shared_intervals,
-            doubts=find_doubts(prepared.data, judged.step.fitted),
+            numbers=self._list_numbers(judged),
             wheel_delay_s=delay,
             ladder=(*below, self._measure(shown, judged.step.errors)),
             without={name: prepared.score(fitted - name, delay).t_mrmse_m for name in shown},
@@ -235,8 +234,6 @@ class Session:
 
 def open_session(prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Session:
     """A new session with the ideal model, fitted."""
-    step = Edit(
-        said="ideal model", model=Model(prepared.vehicle), intervals={}, doubts={}, without={}, refused={}
-    )
+    step = Edit(said="ideal model", model=Model(prepared.vehicle), numbers={}, without={}, refused={})
     fitted = Session(prepared, diagnosis, (step,)).fit()
     return Session(prepared, diagnosis, (replace(fitted.step, said=step.said),))

@@ -253,19 +253,13 @@ def show_session(session: Session) -> dict[str, object]:
 def show_card(session: Session, name: str) -> dict[str, object]:
     """Card of one effect of the current model."""
     step, effect = session.step, session.step.model.effect(name)
-    file = ModelFile(step.model, intervals=step.intervals, doubts=step.doubts)
+    file = ModelFile(step.model, numbers=step.numbers)
     return {
         **describe_effect(effect, step.model),
         "without_m": step.without.get(name),
         "refused": step.refused.get(name),
         "parameters": [
-            show_parameter(
-                effect,
-                one,
-                step.intervals.get(f"{name}.{one.name}"),
-                file.find_doubt(effect, one),
-                is_fitted=not step.by_hand,
-            )
+            show_parameter(effect, one, file.find_number(effect, one), is_fitted=not step.by_hand)
             for one in effect.parameters
             if math.isfinite(effect.values[one.name])
         ],

@@ -15,7 +15,7 @@ from pipeline.core import (
     round_digits,
     suffix_unit,
 )
-from pipeline.models import Excitation, list_effects, name_term
+from pipeline.models import Excitation, Number, list_effects, name_term, split_determined
 from pipeline.recording import Finding, Severity
 from pipeline.results import (
     ABOVE_FLOOR,
@@ -31,13 +31,11 @@ from pipeline.results import (
     Step,
     Undecided,
     Unexplained,
-    Value,
     format_rises,
     is_small,
     key_finding,
     list_added,
     measure_excess,
-    split_determined,
     split_main,
 )
 from pipeline.run import HORIZON_S
@@ -355,7 +353,7 @@ def _format_effect(
 
 
 def _describe_numbers(
-    name: str, numbers: Mapping[str, Value], parts: Sequence[str], values: str, width: int = 0
+    name: str, numbers: Mapping[str, Number], parts: Sequence[str], values: str, width: int = 0
 ) -> Iterator[str]:
     """An id with its values and notes: in one line, or with one line per value."""
     is_long = len(numbers) > _MOST_IN_LINE
@@ -475,16 +473,16 @@ def _format_budget(run: RunDiagnosis) -> str:
     return ""
 
 
-def _list_shared(effect: Named) -> dict[str, Value]:
+def _list_shared(effect: Named) -> dict[str, Number]:
     """Its known values that all runs share."""
     return {name: value for name, value in effect.shown.items() if name not in effect.own}
 
 
-def _format_values(effect: Named, shared: Mapping[str, Value]) -> str:
+def _format_values(effect: Named, shared: Mapping[str, Number]) -> str:
     return "a clock offset of each run:" if is_clock(effect) and effect.by_run else _format_all(shared)
 
 
-def _format_all(numbers: Mapping[str, Value]) -> str:
+def _format_all(numbers: Mapping[str, Number]) -> str:
     """Values by parameter, with their ranges between runs where these are much wider."""
     return ", ".join(f"{name} = {format_with_range(value)}" for name, value in numbers.items())
 

@@ -6,17 +6,17 @@ from functools import lru_cache
 
 from pipeline.core import format_interval, round_digits, split_interval, suffix_unit
 from pipeline.models import (
-    Doubt,
     Effect,
     Late,
     Level,
+    Number,
     Reading,
     find_effect,
     list_effects,
     name_term,
     suggest_manoeuvre,
 )
-from pipeline.results import Named, RunDiagnosis, Undecided, Value, read_model
+from pipeline.results import Named, RunDiagnosis, Undecided, read_model
 
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""
@@ -27,7 +27,7 @@ _MOST_ALTERNATIVES = 3
 """Alternatives of an effect that it names."""
 
 
-def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
+def restore_known(name: str, values: Mapping[str, Number]) -> Effect:
     """The effect for text: digits that intervals support, and of several values those that are known.
 
     A value that is estimated to be neutral stays; so does a single parameter.
@@ -161,17 +161,17 @@ def list_names(candidates: Sequence[str]) -> list[str]:
     return [*names[:2], f"{len(names) - 2} others"] if len(names) > _MOST_ALTERNATIVES else names
 
 
-def format_value(value: Value) -> str:
+def format_value(value: Number) -> str:
     """A value with its interval where there is one, and whether it is at its bound."""
     text = f"{round_digits(value.value, value.digits):.3g}{suffix_unit(value.unit)}"
     if math.isfinite(value.high - value.low):
         text = format_interval(value.value, value.low, value.high, value.unit)
     elif math.isfinite(value.low):
         text += f" [{value.low:.3g}, {value.high:.3g}]"
-    return f"{text} ({mark})" if (mark := Doubt(value.doubt, value.stretches).mark) else text
+    return f"{text} ({value.mark})" if value.doubt else text
 
 
-def format_with_range(value: Value) -> str:
+def format_with_range(value: Number) -> str:
     """A value; where its interval says little about another run, that it is this run's.
 
     The range between runs stands beside it where it was measured how much runs differ.
@@ -185,6 +185,6 @@ def format_with_range(value: Value) -> str:
     )
 
 
-def format_numbers(numbers: Mapping[str, Value]) -> str:
+def format_numbers(numbers: Mapping[str, Number]) -> str:
     """Values of an effect by parameter, with their intervals."""
     return ", ".join(f"{name} = {format_value(value)}" for name, value in numbers.items())

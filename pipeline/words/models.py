@@ -5,6 +5,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from pipeline.core import (
     INPUT_WORDS,
@@ -13,16 +14,15 @@ from pipeline.core import (
     format_digits,
     format_length,
     format_share,
-    number_in,
+    round_digits,
     split_interval,
 )
 from pipeline.datasets import ModelFit
-from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.estimation.transfer import Transfer
-from pipeline.models import Doubt
+from pipeline.models import Number
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, format_rises
 from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall
@@ -100,23 +100,25 @@ def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
     return lines
 
 
-def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """Parameters with intervals, one per line."""
+def format_parameters(
+    numbers: Mapping[str, Number], own: Mapping[str, Mapping[str, Number]] = MappingProxyType({})
+) -> list[str]:
+    """Numbers by label with their intervals, one per line; those that runs have of their own instead.
+
+    Args:
+        numbers: by label ``effect.name``.
+        own: by label, then by run.
+    """
     lines = []
-    for label, entry in parameters.items():
-        rows = entry.get("runs")
-        for row in rows if isinstance(rows, list) else [entry]:
-            unit = "" if entry["unit"] == "1" else entry["unit"]
-            value, *ends = _show_within(row)
+    for label, shared in numbers.items():
+        for run, number in own.get(label, {"": shared}).items():
+            unit = "" if number.unit == "1" else number.unit
+            value, *ends = _show_within(number)
             text = f"  {label:<32}{value:>12} {unit:<8}"
             if ends:
                 text += f"95 %: {' to '.join(ends)}"
-            marks = [said] if (said := entry.get("doubt_text")) else []
-            marks += ["not observable in these runs"] * (row.get("observable") is False)
-            text += "".join(f"  ({mark})" for mark in marks)
-            if "run" in row:
-                text += f"  run {row['run']}"
-            lines.append(text.rstrip())
+            text += f"  ({number.reason})" if number.doubt else ""
+            lines.append(f"{text}  run {run}" if run else text.rstrip())
     return lines
 
 
@@ -156,12 +158,12 @@ def _describe_limit(limit: SpeedLimit, terrain: str) -> str:
     return f"up to {reached[0]} m/s{where} (95 %: {reached[1]} to {reached[2]}); {held}"
 
 
-def _show_within(row: Mapping[str, object]) -> tuple[str, ...]:
+def _show_within(number: Number) -> tuple[str, ...]:
     """A value, and the ends of its interval where there is one, with the digits that this supports."""
-    value, low, high = (number_in(row, key) for key in ("value", "low", "high"))
-    if value is None:
+    value, low, high = (round_digits(one) for one in (number.value, number.low, number.high))
+    if math.isnan(value):
         return ("-",)
-    return (f"{value:.4g}",) if low is None or high is None else split_interval(value, low, high)
+    return (f"{value:.4g}",) if math.isnan(low) else split_interval(value, low, high)
 
 
 def format_contest(contest: Contest) -> list[str]:
@@ -200,9 +202,9 @@ def suggest_export(kind: str, model: str) -> str:
     return f"slip model export {shlex.quote(model)} --to {_TARGETS.get(kind, 'json')}"
 
 
-def list_omitted(doubts: Mapping[str, Doubt]) -> list[str]:
+def list_omitted(doubtful: Mapping[str, Number]) -> list[str]:
     """Notes beside an exported file: the values that it leaves out, and how they are written all the same."""
-    lines = [f"left out: {label}: {doubt.reason}" for label, doubt in doubts.items()]
+    lines = [f"left out: {label}: {number.reason}" for label, number in doubtful.items()]
     return [*lines, "fixed = true beside a value in the model file exports it as your own"] if lines else []
 
 
@@ -239,9 +241,8 @@ def format_change(fit: ModelFit, refusals: Mapping[str, str], *, is_made: bool =
         lines += describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
     if chosen.warning:
         lines.append(chosen.warning)
-    parameters = parameters_as_json(new.fitted.model, new.estimates, fit.file.list_doubts())
-    prior = fit.prior_as_json()
-    lines += ["", "parameters", *format_parameters(parameters)]
+    lines += ["", "parameters", *format_parameters(fit.list_numbers(), fit.file.list_own())]
+    prior = fit.list_prior()
     return [*lines, "", "prior", *format_parameters(prior)] if prior else lines
 
 

@@ -1,10 +1,8 @@
 """The JSON of a diagnosis for people and scripts: its data with the sentences of each part."""
 
-from collections.abc import Mapping
 from typing import Any
 
-from pipeline.models import Doubt
-from pipeline.results import RunDiagnosis, Value, to_json
+from pipeline.results import RunDiagnosis, to_json
 from pipeline.words.effects import (
     describe_clause,
     describe_effect,
@@ -63,14 +61,10 @@ def _describe_effects(run: RunDiagnosis, content: dict[str, Any]) -> None:
         entry["could_be"] = [
             {"level": one.level.value, "name": one.name, "text": one.text} for one in list_readings(effect)
         ]
-        _mark(entry["parameters"], effect.parameters)
+        entry["parameters"] = {name: number.to_json() for name, number in effect.parameters.items()}
     for item, entry in zip(run.undecided, content["undecided"], strict=True):
         entry["separate_by"] = describe_separation(item)
-        for name, values in item.parameters.items():
-            _mark(entry["parameters"][name], values)
-
-
-def _mark(entries: dict[str, Any], values: Mapping[str, Value]) -> None:
-    for name, value in values.items():
-        entries[name]["undetermined"] = value.is_undetermined
-        entries[name]["doubt_text"] = Doubt(value.doubt, value.stretches).reason
+        entry["parameters"] = {
+            name: {key: number.to_json() for key, number in numbers.items()}
+            for name, numbers in item.parameters.items()
+        }

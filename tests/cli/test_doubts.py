@@ -11,8 +11,8 @@ from verbs import run_verb
 from pipeline.api.fitted_model import Model
 from pipeline.export import export_model, list_omitted, list_targets
 from pipeline.models import (
+    DOUBTS,
     TOO_SHORT,
-    Doubt,
     find_effect,
     format_model,
     parse_model,
@@ -20,7 +20,7 @@ from pipeline.models import (
 )
 
 LABELS = {"drive_lag.tau", "effective_track.k"}
-REASON = Doubt(TOO_SHORT).reason
+MARK, REASON = DOUBTS[TOO_SHORT]
 RUN = "field/wide"
 FIT = {"input": "command", "runs": [{"run": "a"}]}
 
@@ -56,7 +56,7 @@ def test_each_face_says_of_the_same_numbers_that_the_run_is_too_short(place: Pat
             next(iter(kept["runs"]))["effects"] if "runs" in kept else kept["effects"]
         ),
         "model show": list_doubtful(shown["effects"]),
-        "model file": {label: doubt.id for label, doubt in file.list_doubts().items()},
+        "model file": {label: number.doubt for label, number in file.list_doubtful().items()},
         "fit": {label: entry["doubt"] for label, entry in fitted.items()},
         "Python": dict(zip(frame["parameter"], frame["doubt"], strict=True)),
     }
@@ -64,10 +64,9 @@ def test_each_face_says_of_the_same_numbers_that_the_run_is_too_short(place: Pat
     omitted = dict.fromkeys(LABELS, REASON)
     assert json.loads(exported.stdout)["omitted"] == omitted
     assert all(f"left out: {label}: {REASON}" in exported.stderr for label in LABELS)
-    mark = Doubt(TOO_SHORT).mark
     for words in (["diagnose", RUN], ["diagnose", RUN, "--all"]):
         screen = show(*words, cwd=place)
-        assert all(re.search(rf"{name} = [^\n]*\({mark}\)", screen) for name in ("k", "tau")), screen
+        assert all(re.search(rf"{name} = [^\n]*\({MARK}\)", screen) for name in ("k", "tau")), screen
     assert show("model", "show", "m.toml", cwd=place).count(f"({REASON})") == len(LABELS)
 
 
@@ -75,17 +74,18 @@ def test_each_face_says_of_the_same_numbers_that_the_run_is_too_short(place: Pat
 def test_what_depends_on_a_value_in_doubt_is_a_comment_with_the_reason(target: str) -> None:
     effects = (find_effect("drive_lag")(tau=2.7331), find_effect("effective_track")(k=1.8))
     intervals = {"drive_lag.tau": (2.6, 2.8), "effective_track.k": (1.7, 1.9)}
+    known = intervals | {"wheel_speed_limit.limit": (5.9, 6.1)}
     sure = make(
         *effects,
         find_effect("wheel_speed_limit")(limit=6.0),
         fit=FIT,
-        intervals=intervals | {"wheel_speed_limit.limit": (5.9, 6.1)},
+        intervals=known,
     )
-    doubts = {label: Doubt(TOO_SHORT) for label in sure.intervals}
+    doubts = dict.fromkeys(known, (TOO_SHORT, 0))
     doubtful = parse_model(
-        format_model(make(*sure.model, fit=FIT, intervals=sure.intervals, doubts=doubts)), Path("m")
+        format_model(make(*sure.model, fit=FIT, intervals=known, doubts=doubts)), Path("m")
     )
-    assert doubtful.doubts == doubts
+    assert {label: one.doubt for label, one in doubtful.numbers.items()} == dict.fromkeys(known, TOO_SHORT)
     text, plain = export_model(doubtful, target), export_model(sure, target)
     there, known = (read(target, one) for one in (plain, text))
     measured = set(there) - set(known)
@@ -102,15 +102,17 @@ def test_what_depends_on_a_value_in_doubt_is_a_comment_with_the_reason(target: s
 def test_every_target_lists_what_it_leaves_out() -> None:
     file = make(
         find_effect("drive_lag")(tau=0.3), fit=FIT,
-        intervals={"drive_lag.tau": (0.2, 0.4)}, doubts={"drive_lag.tau": Doubt("few_stretches", 3)},
+        intervals={"drive_lag.tau": (0.2, 0.4)}, doubts={"drive_lag.tau": ("few_stretches", 3)},
     )  # fmt: skip
     for target in list_targets():
-        assert list_omitted(file, target.name) == ({} if target.takes_doubtful else file.doubts), target.name
+        assert list_omitted(file, target.name) == ({} if target.takes_doubtful else file.list_doubtful()), (
+            target.name
+        )
     assert "read from 3 of the driven stretches" in export_model(file, "python")
 
 
 def test_a_value_that_somebody_fixes_is_theirs() -> None:
     effect = find_effect("drive_lag")(tau=0.3).fix("tau")
-    file = make(effect, vehicle=HUSKY, fit=FIT, doubts={"drive_lag.tau": Doubt(TOO_SHORT)})
+    file = make(effect, vehicle=HUSKY, fit=FIT, doubts={"drive_lag.tau": (TOO_SHORT, 0)})
     assert not list_omitted(file, "nav2")
     assert read("nav2", export_model(file, "nav2"))

@@ -15,8 +15,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Diagnosis, EstimationData, Input, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.models import read_model, write_model
-from pipeline.results import Value
+from pipeline.models import Number, read_model, write_model
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -79,7 +78,7 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
         assert told["timing"]["pose_delay_s"] == pytest.approx(clock["value"], abs=1e-4)
         # A value has the digits that its interval supports.
         value, low, high = (clock[name] for name in ("value", "low", "high"))
-        assert f"d = {format_value(Value(value, low, high, 's'))} in {run.run}" in screen
+        assert f"d = {format_value(Number(value, low, high, 's'))} in {run.run}" in screen
     for name, value in effects.items():
         (number,) = named[name].values()
         assert number["low"] < value < number["high"]

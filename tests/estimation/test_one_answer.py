@@ -16,15 +16,15 @@ from few import few
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import EstimationData, Input, carry_over, diagnose_runs, load_recording
-from pipeline.estimation.estimates import parameters_as_json
+from pipeline.estimation.estimates import list_values
 from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.models import read_model, write_model
+from pipeline.models import Number, read_model, write_model
 from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
 from pipeline.report.sections import format_remaining
-from pipeline.results import RunDiagnosis, Value, read_result, to_json
+from pipeline.results import RunDiagnosis, read_result, to_json
 from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.simulate import simulate_case
 from pipeline.web.prepared import prepare_run
@@ -137,16 +137,15 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
         if effect in unknown and name in unknown:
             continue
         low, high = (math.nan if number[end] is None else number[end] for end in ("low", "high"))
-        shown = re.escape(format_value(Value(number["value"], low, high, "1")).split()[0])
+        shown = re.escape(format_value(Number(number["value"], low, high, "1")).split()[0])
         assert re.search(rf"{name} = {shown}(?![\d.])", screen), (effect, name)
 
 
 def check_model_verbs(told: Json, file: ModelFile, data: EstimationData) -> Json:
     """What the model verbs find on the run is what was written; returns the errors of the whole model."""
     judged = assess_model(data, file.model)
-    found: Json = parameters_as_json(judged.fitted.model, judged.estimates)
     for effect, name, number in list_numbers(told):
-        entry = found[f"{effect}.{name}"]
+        entry: Json = list_values(judged.fitted.model.effect(effect), judged.estimates)[name].to_json()
         assert number["at_bound"] == entry["at_bound"]
         for end in ("value", "low", "high"):
             assert same(number[end], entry[end]), (effect, name, end)

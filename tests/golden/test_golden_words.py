@@ -12,21 +12,11 @@ from golden import read_page
 from msgspec.structs import replace
 from report_synthesis import make_report
 
-from pipeline.models import find_effect, list_effects
+from pipeline.models import Interval, Number, find_effect, list_effects
 from pipeline.recording import FAULTS, Finding
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
-from pipeline.results import (
-    Delays,
-    Detectable,
-    Errors,
-    Interval,
-    Named,
-    RunDiagnosis,
-    Step,
-    Unexplained,
-    Value,
-)
+from pipeline.results import Delays, Detectable, Errors, Named, RunDiagnosis, Step, Unexplained
 from pipeline.sources import list_presets
 from pipeline.words.diagnosis import list_lines
 from pipeline.words.objects import diagnosis_as_json
@@ -144,10 +134,10 @@ def test_sentences_of_effects(check_golden: Check) -> None:
 def test_lines_of_a_diagnosis(check_golden: Check) -> None:
     """Numbers at a bound, rises, findings that repeat, and a rest with and without a formula."""
     servo = {
-        "tau": Value(0.681, 0.587, 0.775, "s"),
-        "reset": Value(0.0, math.nan, math.nan, "1/s", at_bound=True),
-        "scrub": Value(1.3312, 1.3300, 1.3324, "m/s", another_run=Interval(0.42, 2.24)),
-        "creep": Value(
+        "tau": Number(0.681, 0.587, 0.775, "s"),
+        "reset": Number(0.0, math.nan, math.nan, "1/s", at_bound=True),
+        "scrub": Number(1.3312, 1.3300, 1.3324, "m/s", another_run=Interval(0.42, 2.24)),
+        "creep": Number(
             0.3601, 0.3597, 0.3605, "s/m", another_run=Interval(0.277, 0.443), is_spread_measured=True
         ),
     }
@@ -165,8 +155,8 @@ def test_lines_of_a_diagnosis(check_golden: Check) -> None:
         vehicle=PRESETS["warthog"],
         effects=(
             Named("wheel_servo", servo),
-            Named("torque_limit", {"limit": Value(14.4, unit="m/s^2")}),
-            Named("drive_lag", {"tau": Value(0.3, 0.2, 0.4, "s")}),
+            Named("torque_limit", {"limit": Number(14.4, unit="m/s^2")}),
+            Named("drive_lag", {"tau": Number(0.3, 0.2, 0.4, "s")}),
         ),
         detectable=(
             Detectable("yaw_drift", "c", "rad/s", 0.016),

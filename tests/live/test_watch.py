@@ -22,7 +22,8 @@ from pipeline import live
 from pipeline.cli.screen import format_watch
 from pipeline.live import RUNNING_T, choose_recording, follow, list_known, list_passing, summarize
 from pipeline.logs import LogError
-from pipeline.results import Errors, GrownEvidence, Growth, Named, RunDiagnosis, Step, Unobservable, Value
+from pipeline.models import Number
+from pipeline.results import Errors, GrownEvidence, Growth, Named, RunDiagnosis, Step, Unobservable
 from pipeline.simulate import Scenario, simulate_run, write_log
 
 CHUNK = 1 << 14
@@ -259,7 +260,7 @@ def test_a_file_that_was_taken_away_while_it_was_watched_is_told(
 
 
 def name(effect: str, t: float, width: float = 0.1, *, corrected: bool = False) -> Named:
-    number = Value(1.8, 1.8 - width, 1.8 + width)
+    number = Number(1.8, 1.8 - width, 1.8 + width)
     return Named(
         effect, {"k": number}, corrected=corrected, growth=Growth(GrownEvidence((1.0, 2.0), (1.0, t)))
     )

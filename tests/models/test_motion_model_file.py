@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 import pytest
@@ -6,6 +7,7 @@ from motion_runs import vehicle_of
 from pipeline.models import (
     Model,
     ModelFile,
+    Number,
     format_model,
     list_effects,
     load_effects,
@@ -46,7 +48,10 @@ def test_every_effect_survives_a_round_trip() -> None:
         model = Model(vehicle_of(preset), tuple(effects))
         label = f"{effects[1].id}.{effects[1].parameters[0].name}"
         file = ModelFile(
-            model, per_run=(label,), intervals={label: (0.25, 0.75)}, note='a "note"\nwith lines'
+            model,
+            per_run=(label,),
+            numbers={label: Number(math.nan, 0.25, 0.75)},
+            note='a "note"\nwith lines',
         )
         again = parse_model(format_model(file), HERE)
         assert again == file

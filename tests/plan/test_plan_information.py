@@ -11,7 +11,7 @@ from plan_game import record
 from scipy.special import stdtrit
 from verbs import run_verb
 
-from pipeline.models import Largest, find_effect
+from pipeline.models import Largest, Number, find_effect
 from pipeline.plan import (
     PlanError,
     Studied,
@@ -24,7 +24,7 @@ from pipeline.plan import (
 )
 from pipeline.plan.plan import DECIDED_T, Assessment, Question, find_strength
 from pipeline.plan.plan_files import StoredPlan
-from pipeline.results import Named, RunDiagnosis, Undecided, Unobservable, Value
+from pipeline.results import Named, RunDiagnosis, Undecided, Unobservable
 from pipeline.simulate import Program, make_scenario
 from pipeline.sources import find_preset
 
@@ -84,7 +84,7 @@ def test_an_interval_is_promised_only_where_few_blocks_would_show_it_too() -> No
 
 
 def _diagnose(effects: tuple[str, ...] = (), undecided: tuple[tuple[str, ...], ...] = ()) -> RunDiagnosis:
-    named = tuple(Named(name, {"k": Value(1.5, 1.48, 1.52, "1")}, 0.5) for name in effects)
+    named = tuple(Named(name, {"k": Number(1.5, 1.48, 1.52, "1")}, 0.5) for name in effects)
     return RunDiagnosis("run", "command", effects=named, undecided=tuple(Undecided(one) for one in undecided))
 
 

@@ -10,19 +10,9 @@ import pytest
 from drawn_diagnoses import draw_diagnosis
 
 from pipeline.core import SlipError
+from pipeline.models import Interval, Number
 from pipeline.recording import Finding
-from pipeline.results import (
-    DataNeed,
-    Growth,
-    Interval,
-    Named,
-    Narrowing,
-    Region,
-    RunDiagnosis,
-    Value,
-    read_result,
-    to_json,
-)
+from pipeline.results import DataNeed, Growth, Named, Narrowing, Region, RunDiagnosis, read_result, to_json
 from pipeline.results.reading import (
     find_refusal,
     has_no_pose,
@@ -38,7 +28,7 @@ from pipeline.words.verdict import format_verdict
 DRAWN = draw_diagnosis({"effective_track": {"k": 1.79}}, [(1.06, 0.96), (0.44, 0.14)])
 OPEN = Named(
     "drive_lag",
-    {"tau": Value(0.3, unit="s", another_run=Interval(0.1, 0.5))},
+    {"tau": Number(0.3, unit="s", another_run=Interval(0.1, 0.5))},
     growth=Growth(None, {"tau": Narrowing((10.0, 20.0), (math.nan, 0.1))}),
 )
 

@@ -18,7 +18,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.api import Model, load
 from pipeline.estimation import Input
 from pipeline.estimation.prediction import predict_at
-from pipeline.models import TOO_SHORT, Doubt, read_model
+from pipeline.models import DOUBTS, TOO_SHORT, Number, read_model
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import read_model as read_diagnosed_model
@@ -59,7 +59,7 @@ def ids(session: Json) -> list[str]:
 def test_a_card_says_the_doubt_that_the_saved_file_has(workbench: Workbench) -> None:
     session = change(workbench, "add", effect="effective_track")
     (reason,) = {one["doubt"] for card in session["effects"] for one in card["parameters"]}
-    assert reason == Doubt(TOO_SHORT).reason
+    assert reason == DOUBTS[TOO_SHORT][1]
 
 
 def test_the_hidden_effect_makes_the_error_fall_and_undo_brings_it_back(workbench: Workbench) -> None:
@@ -358,7 +358,7 @@ def test_a_formula_that_the_diagnosis_found_is_added(workbench: Workbench) -> No
 def test_the_slider_of_a_formula_has_steps_that_are_small_beside_its_value(value: float) -> None:
     parameter = make_parameter("k_1", "s/m", (-100.0, 100.0))
     term = FormulaEffect("suggested_term", {"v_y": "k_1 * v0 * v0"}, (parameter,), k_1=value)
-    shown: Json = show_parameter(term, parameter, None, Doubt(), is_fitted=True)
+    shown: Json = show_parameter(term, parameter, Number(term.values[parameter.name]), is_fitted=True)
     assert shown["from"] < min(0.0, value) <= max(0.0, value) < shown["to"]
     assert shown["step"] < 0.05 * abs(value)
 

@@ -5,16 +5,9 @@ from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 
 from pipeline.core import format_length
-from pipeline.models import name_term
+from pipeline.models import Number, name_term
 from pipeline.recording import Finding
-from pipeline.results import (
-    DataNeed,
-    Named,
-    Region,
-    RunDiagnosis,
-    Unexplained,
-    Value,
-)
+from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained
 from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
@@ -76,7 +69,7 @@ LAGS = {"mean": "speed", "diff": "turning"}
     ],
 )
 def test_an_effect_on_a_screen_says_what_its_number_is(name: str, units: dict[str, str], text: str) -> None:
-    values = {key: Value(2.0, low=1.9, high=2.1, unit=unit) for key, unit in units.items()}
+    values = {key: Number(2.0, low=1.9, high=2.1, unit=unit) for key, unit in units.items()}
     assert format_short(Named(name, values)) == text
 
 
