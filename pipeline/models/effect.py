@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import ClassVar, Literal, Self, TypeVar
 
 from pipeline.core import suffix_unit
+from pipeline.models.pairs import list_pairs
 from pipeline.models.parameter import (
     Conditions,
     Excitation,
@@ -75,6 +76,8 @@ ANY = list_kinds()
 class Effect(ABC):
     """One physical cause of a deviation from the ideal velocity.
 
+    Facts about pairs of the catalogue's effects are those of `pairs.toml`.
+
     Attributes:
         id: stable name.
         place: stage at which it acts; `rank` orders the effects of one stage.
@@ -84,6 +87,7 @@ class Effect(ABC):
         needs: excitation that a run must contain to identify it.
         confused_with: effects with nearly the same response at first order or under poor excitation.
         equivalent_to: effects that no recording in which `is_equivalent` holds distinguishes from it.
+        equivalent_when: what holds then, in words.
         same_in_one_motion: effects not distinguishable from it by driving straight only, or turning only.
         same_at_one_speed: effects not distinguishable from it while one speed only is commanded.
         contains: effects that are special cases of it: it explains whatever they explain.
@@ -124,6 +128,12 @@ class Effect(ABC):
     has_state: bool = False
     readings: tuple[Reading, ...] = ()
     open_numbers: frozenset[str] = frozenset()
+
+    def __init_subclass__(cls) -> None:
+        """Add the facts about pairs of the catalogue."""
+        super().__init_subclass__()
+        for name, others in list_pairs().get(cls.__dict__.get("id", ""), {}).items():
+            setattr(cls, name, others)
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)

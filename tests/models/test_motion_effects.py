@@ -18,6 +18,7 @@ from pipeline.models.catalogue import find_late_effect, format_page
 from pipeline.models.effect import Excitation, KinematicEffect, Late
 from pipeline.models.expression import parse_expression
 from pipeline.models.families import check_formula
+from pipeline.models.pairs import list_pairs
 from pipeline.models.parameter import Conditions, Largest, is_of_one_run, parse_unit
 from pipeline.run import MotionRun
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
@@ -306,12 +307,14 @@ def check_sizes(effect: type[Effect]) -> None:
 
 
 def check_relations(effect: type[Effect]) -> None:
-    """They hold on both sides."""
-    assert set(effect.confused_with) | set(effect.equivalent_to) <= BY_ID.keys() - {effect.id}
+    """They name effects, and those that hold on both sides say so on both."""
+    facts = list_pairs().get(effect.id, {})
+    assert list_pairs().keys() <= BY_ID.keys()
+    for relation, named in facts.items():
+        assert getattr(effect, relation) == named
+        assert relation == "equivalent_when" or set(named) <= BY_ID.keys() - {effect.id}
     assert bool(effect.equivalent_to) == bool(effect.equivalent_when)
-    assert set(effect.contains) <= BY_ID.keys() - {effect.id}
     assert all(effect.id in BY_ID[name].same_in_one_motion for name in effect.same_in_one_motion)
-    assert all(effect.id in BY_ID[name].equivalent_to for name in effect.equivalent_to)
     for part in effect.parts:
         assert part.name in {p.name for p in effect.parameters}
         assert part.parameter in {p.name for p in BY_ID[part.effect].parameters}

@@ -34,8 +34,6 @@ AccelerationLimit = declare(
     rank=10,
     kinds=WHEELED,
     needs=(Excitation.CHANGES, Excitation.LARGE),
-    confused_with=("drive_lag", "body_inertia"),
-    same_in_one_motion=("body_acceleration_limit", "turn_acceleration_limit"),
     is_degenerate=is_short("wheel"),
     list_usual=take_largest("wheel"),
 )

@@ -37,8 +37,6 @@ BodyAccelerationLimit = declare(
     rank=2,
     kinds=SIDES,
     needs=(Excitation.CHANGES, Excitation.LARGE),
-    confused_with=("acceleration_limit", "wheel_servo", "drive_lag"),
-    same_in_one_motion=("acceleration_limit",),
     is_degenerate=is_short("speed"),
     list_usual=take_largest("speed"),
 )

@@ -40,9 +40,6 @@ class BodyInertia(BodyEffect):
         ),
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
-    confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
-    equivalent_to = ("drive_lag",)
-    equivalent_when = "if the run never turns, or only turns on the spot"
     late = Late.BODY
     is_equivalent = is_one_motion
 

@@ -26,8 +26,6 @@ BodySpeedLimit = declare(
     ),
     rank=10,
     needs=(Excitation.LARGE, Excitation.SPEED_SPREAD),
-    confused_with=("wheel_speed_limit", "speed_slip"),
-    same_at_one_speed=("drive_gain", "wheel_servo", "wheel_radius"),
     place=Place.COMMAND,
     is_degenerate=never_reached,
 )

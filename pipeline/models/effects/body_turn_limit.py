@@ -46,7 +46,6 @@ BodyTurnLimit = declare(
     ),
     rank=20,
     needs=(Excitation.LARGE, Excitation.TURNING),
-    confused_with=("wheel_speed_limit", "turn_droop"),
     place=Place.COMMAND,
     is_degenerate=never_reached,
     list_softer=_list_softer,

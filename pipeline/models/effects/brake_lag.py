@@ -28,9 +28,7 @@ BrakeLag = declare(
     rank=25,
     kinds=WHEELED,
     needs=(Excitation.CHANGES,),
-    confused_with=("drive_lag", "turn_lag", "acceleration_limit"),
     walk=_walk,
-    contains=("drive_lag",),
     is_degenerate=are_equal(0.2, 0.04),
     collapse=to_one_lag,
 )

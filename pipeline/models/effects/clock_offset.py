@@ -36,9 +36,6 @@ class ClockOffset(ReportEffect):
         ),
     )
     needs = (Excitation.CHANGES,)
-    confused_with = ("drive_lag", "body_inertia")
-    equivalent_to = ("transport_delay",)
-    equivalent_when = "if the input is the command and there are no encoders, no gyro and no other clock"
     late = Late.POSES
     readings = (
         Reading(Level.VEHICLE, "clock_offset", "a constant latency of the localization"),

@@ -104,9 +104,6 @@ class ContactFriction(JointBody):
         {"friction": 0.3, "creep": 0.5, "k": 2.5, "gyration": 1.8},
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
-    confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")
-    contains = ("effective_track", "body_inertia")
-    companions = ("lateral_skid",)
     is_kinematic = True
 
     def is_degenerate(self, conditions: Conditions) -> bool:

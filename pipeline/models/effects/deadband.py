@@ -51,7 +51,6 @@ Deadband = declare(
     rank=30,
     kinds=WHEELED,
     needs=(Excitation.SMALL,),
-    confused_with=("turn_droop",),
     place=Place.COMMAND,
     is_degenerate=_is_small,
     list_usual=_list_usual,

@@ -20,6 +20,5 @@ DifferenceGain = declare(
     rank=1,
     kinds=SIDES,
     needs=(Excitation.TURNING,),
-    confused_with=("effective_track", "turn_droop", "wheel_servo", "body_turn_limit"),
     can_show=has_encoders,
 )

@@ -29,7 +29,5 @@ DriveGain = declare(
     SHARE,
     scale_role="gain",
     needs=(Excitation.SPEED_SPREAD,),
-    confused_with=("wheel_radius", "wheel_speed_limit", "wheel_servo", "gain_drift", "load_droop"),
-    same_at_one_speed=("body_speed_limit", "wheel_speed_limit", "wheel_servo", "load_droop"),
     can_show=has_encoders,
 )

@@ -37,10 +37,6 @@ DriveLag = declare(
     ),
     rank=20,
     needs=(Excitation.CHANGES,),
-    confused_with=("transport_delay", "turn_lag", "acceleration_limit"),
-    equivalent_to=("body_inertia",),
-    equivalent_when="if the run never turns, or only turns on the spot",
-    same_in_one_motion=("turn_lag",),
     is_equivalent=is_one_motion,
 )
 

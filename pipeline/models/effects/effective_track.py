@@ -39,11 +39,9 @@ EffectiveTrack = declare(
     rank=20,
     kinds=SIDES,
     needs=(Excitation.TURNING,),
-    confused_with=("wheel_radius", "terrain_change"),
     readings=(
         Reading(Level.VEHICLE, "geometry", "a wrong track width"),
         Reading(Level.TERRAIN, "effective_track", "skidding"),
         Reading(Level.RUN, "effective_track", "a change of tyre pressure or load"),
     ),
-    tied_to=("wheel_radius",),
 )

@@ -38,7 +38,6 @@ EffectiveWheelbase = declare(
     rank=30,
     kinds=ACKERMANN,
     needs=(Excitation.STEERING,),
-    confused_with=("steering_gain", "understeer"),
     readings=(
         Reading(Level.VEHICLE, "geometry", "a wrong wheelbase"),
         Reading(Level.TERRAIN, "effective_wheelbase", "deforming tyres"),

@@ -16,6 +16,5 @@ GainDrift = declare(
     FADE,
     kinds=WHEELED,
     needs=(Excitation.LONG,),
-    confused_with=("time_drift", "drive_gain"),
     can_show=has_encoders,
 )

@@ -47,9 +47,6 @@ GradeLoad = declare(
     rank=15,
     kinds=("differential", "ackermann"),
     needs=(Excitation.SLOPE,),
-    confused_with=("slope_slip", "drive_gain"),
-    equivalent_to=("slope_creep",),
-    equivalent_when="if there are no encoders",
     is_equivalent=has_no_encoders,
     can_show=_is_sloping,
 )

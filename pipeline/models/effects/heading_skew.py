@@ -38,7 +38,6 @@ class HeadingSkew(ReportEffect):
         ),
     )
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
-    confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING
     readings = (
         Reading(Level.VEHICLE, "heading_skew", "a recorder that stamps headings late"),

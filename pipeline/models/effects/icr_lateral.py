@@ -22,8 +22,5 @@ IcrLateral = declare(
         plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
     ),
     needs=(Excitation.TURNING,),
-    confused_with=("wheel_asymmetry",),
-    equivalent_to=("lever_arm",),
-    equivalent_when="always: a pose measured at l_y = -y_icr moves in the same way",
     place=Place.CENTRE,
 )

@@ -37,9 +37,6 @@ IcrOffset = declare(
         between_runs=Spread(0.013),
     ),
     needs=(Excitation.TURNING,),
-    confused_with=("lateral_skid", "heading_skew"),
-    equivalent_to=("lever_arm",),
-    equivalent_when="always: a pose measured at l_x = -x_icr moves in the same way",
     place=Place.CENTRE,
     is_outside=_is_outside,
 )

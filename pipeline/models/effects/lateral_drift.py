@@ -13,5 +13,4 @@ LateralDrift = declare(
     "v_y += c * turning",
     Parameter("c", "m/s", (-0.5, 0.5), 0.0, "speed to the left", 0.05),
     needs=(Excitation.BOTH_SIGNS,),
-    confused_with=("yaw_misalignment", "side_slope_creep"),
 )

@@ -26,5 +26,4 @@ LateralPull = declare(
     rank=21,
     kinds=("mecanum", "omni"),
     needs=(Excitation.BOTH_SIGNS,),
-    confused_with=("yaw_misalignment", "lateral_drift"),
 )

@@ -26,6 +26,4 @@ LateralScale = declare(
     rank=25,
     kinds=SIDEWAYS,
     needs=(Excitation.SIDEWAYS,),
-    confused_with=("roller_slip", "wheel_radius"),
-    tied_to=("wheel_radius",),
 )

@@ -26,5 +26,4 @@ LateralSkid = declare(
         between_runs=Spread(0.064),
     ),
     needs=(Excitation.TURNING, Excitation.SPEED_SPREAD),
-    confused_with=("icr_offset", "body_inertia", "heading_skew", "drive_lag"),
 )

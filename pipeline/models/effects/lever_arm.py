@@ -15,9 +15,6 @@ LeverArm = declare(
     Parameter("l_y", "m", (-10.0, 10.0), 0.0, "point left of base_link", 0.08),
     rank=10,
     needs=(Excitation.TURNING,),
-    confused_with=("lateral_skid", "wheel_asymmetry"),
-    equivalent_to=("icr_offset", "icr_lateral"),
-    equivalent_when="always: a centre of rotation at (-l_x, -l_y) moves in the same way",
     parts=(Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0)),
     place=Place.LOCALIZATION,
 )

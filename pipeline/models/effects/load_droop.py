@@ -38,7 +38,5 @@ LoadDroop = declare(
     rank=12,
     kinds=ANY,
     needs=(Excitation.SPEED_SPREAD,),
-    confused_with=("drive_gain", "deadband", "wheel_servo"),
-    same_at_one_speed=("drive_gain", "body_speed_limit", "wheel_speed_limit", "wheel_servo"),
     can_show=has_encoders,
 )

@@ -29,8 +29,6 @@ MotorImbalance = declare(
     ),
     rank=30,
     kinds=("differential",),
-    acts_with=("wheel_servo",),
     needs=(Excitation.BOTH_SIGNS, Excitation.LARGE),
-    confused_with=("side_gain", "wheel_asymmetry", "wheel_servo"),
     can_show=has_encoders,
 )

@@ -39,6 +39,5 @@ ReversalPause = declare(
     rank=5,
     kinds=WHEELED,
     needs=(Excitation.BOTH_SIGNS, Excitation.CHANGES),
-    confused_with=("acceleration_limit", "drive_lag", "transport_delay", "deadband"),
     walk=_walk,
 )

@@ -24,5 +24,4 @@ RollerSlip = declare(
     ),
     kinds=SIDEWAYS,
     needs=(Excitation.SIDEWAYS, Excitation.SPEED_SPREAD),
-    confused_with=("lateral_scale",),
 )

@@ -25,6 +25,5 @@ SideGain = declare(
     rank=1,
     kinds=("differential", "mecanum"),
     needs=(Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD),
-    confused_with=("wheel_asymmetry", "side_lag"),
     can_show=has_encoders,
 )

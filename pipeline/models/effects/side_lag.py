@@ -19,8 +19,6 @@ SideLag = declare(
     rank=35,
     kinds=("differential",),
     needs=(Excitation.CHANGES,),
-    confused_with=("drive_lag", "turn_lag", "icr_lateral"),
-    contains=("drive_lag",),
     is_degenerate=are_equal(0.15, 0.03),
     collapse=to_one_lag,
 )

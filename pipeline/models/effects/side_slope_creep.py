@@ -23,6 +23,4 @@ SideSlopeCreep = declare(
         one_sign=True,
     ),
     needs=(Excitation.SLOPE, Excitation.SPEED_SPREAD),
-    confused_with=("side_slope_slip", "lateral_drift"),
-    same_at_one_speed=("side_slope_slip",),
 )

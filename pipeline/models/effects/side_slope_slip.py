@@ -23,6 +23,4 @@ SideSlopeSlip = declare(
         one_sign=True,
     ),
     needs=(Excitation.SLOPE, Excitation.SPEED_SPREAD),
-    confused_with=("side_slope_creep", "yaw_misalignment", "lateral_skid"),
-    same_at_one_speed=("side_slope_creep",),
 )

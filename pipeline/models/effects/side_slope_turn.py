@@ -22,5 +22,4 @@ SideSlopeTurn = declare(
         plausible=Plausible(-1.5, 1.5, "a curve of 4 m radius on a slope of 10 degrees"),
     ),
     needs=(Excitation.SLOPE,),
-    confused_with=("wheel_asymmetry", "yaw_drift"),
 )

@@ -23,9 +23,5 @@ SlopeCreep = declare(
         one_sign=True,
     ),
     needs=(Excitation.SLOPE, Excitation.SPEED_SPREAD),
-    confused_with=("slope_slip",),
-    equivalent_to=("grade_load",),
-    equivalent_when="if there are no encoders",
-    same_at_one_speed=("slope_slip",),
     is_equivalent=has_no_encoders,
 )

@@ -23,6 +23,4 @@ SlopeSlip = declare(
         one_sign=True,
     ),
     needs=(Excitation.SLOPE, Excitation.SPEED_SPREAD),
-    confused_with=("slope_creep", "grade_load", "wheel_radius"),
-    same_at_one_speed=("slope_creep",),
 )

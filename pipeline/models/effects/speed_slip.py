@@ -22,5 +22,4 @@ SpeedSlip = declare(
         one_sign=True,
     ),
     needs=(Excitation.SPEED_SPREAD,),
-    confused_with=("wheel_radius", "turning_resistance"),
 )

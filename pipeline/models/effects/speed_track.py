@@ -25,5 +25,4 @@ SpeedTrack = declare(
     ),
     kinds=SIDES,
     needs=(Excitation.TURNING, Excitation.SPEED_SPREAD),
-    confused_with=("effective_track", "turn_lag"),
 )

@@ -25,5 +25,4 @@ SteeringGain = declare(
     rank=50,
     kinds=ACKERMANN,
     needs=(Excitation.STEERING,),
-    confused_with=("understeer",),
 )

@@ -23,5 +23,4 @@ SteeringLag = declare(
     rank=60,
     kinds=ACKERMANN,
     needs=(Excitation.CHANGES, Excitation.STEERING),
-    confused_with=("transport_delay",),
 )

@@ -32,8 +32,5 @@ SteeringOffset = declare(
     rank=70,
     kinds=ACKERMANN,
     needs=(Excitation.SPEED_SPREAD,),
-    confused_with=("yaw_drift",),
-    equivalent_to=("steering_sensor_offset",),
-    equivalent_when="if only commands and body motion are used",
     is_equivalent=has_no_encoders,
 )

@@ -46,7 +46,6 @@ SteeringPlay = declare(
     rank=65,
     kinds=ACKERMANN,
     needs=(Excitation.STEERING, Excitation.CHANGES),
-    confused_with=("steering_gain", "steering_lag"),
     walk=_walk,
     signal="delta",
 )

@@ -44,6 +44,5 @@ SteeringRateLimit = declare(
     rank=55,
     kinds=ACKERMANN,
     needs=(Excitation.STEERING, Excitation.CHANGES),
-    confused_with=("steering_lag", "transport_delay"),
     is_degenerate=_is_quick,
 )

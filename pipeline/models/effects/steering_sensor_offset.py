@@ -19,8 +19,5 @@ SteeringSensorOffset = declare(
     replace(SteeringOffset.parameters[0], about="true minus measured steering angle", typical=0.02),
     kinds=ACKERMANN,
     needs=SteeringOffset.needs,
-    confused_with=SteeringOffset.confused_with,
-    equivalent_to=("steering_offset",),
-    equivalent_when=SteeringOffset.equivalent_when,
     can_show=has_encoders,
 )

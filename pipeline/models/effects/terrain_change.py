@@ -64,8 +64,6 @@ class TerrainChange(KinematicEffect):
         ),
     )
     needs = (Excitation.LONG, Excitation.TURNING)
-    confused_with = ("time_drift", "wheel_radius", "effective_track")
-    contains = ("effective_track", "wheel_radius", "time_drift")
     # A change point reduces any residual a little.
 
     def roll(self, rolling: Rolling, context: RunContext) -> Rolling:

@@ -25,5 +25,4 @@ TimeDrift = declare(
     FADE,
     rank=50,
     needs=(Excitation.LONG,),
-    confused_with=("terrain_change", "wheel_radius", "gain_drift"),
 )

@@ -86,8 +86,6 @@ TorqueLimit = declare(
         {"tau": 0.5, "limit": 12.0},
     ),
     needs=(Excitation.CHANGES, Excitation.LARGE, Excitation.SMALL),
-    confused_with=("drive_lag", "acceleration_limit", "wheel_servo"),
-    contains=("drive_lag", "acceleration_limit"),
     walk=_walk,
     is_degenerate=_is_lag_or_ramp,
     collapse=_collapse,

@@ -48,8 +48,5 @@ TransportDelay = declare(
     rank=40,
     late=Late.COMMANDS,
     needs=(Excitation.CHANGES,),
-    confused_with=("drive_lag", "turn_lag", "body_inertia"),
-    equivalent_to=("clock_offset",),
-    equivalent_when="if the input is the command and there are no encoders, no gyro and no other clock",
     is_equivalent=_has_one_clock,
 )

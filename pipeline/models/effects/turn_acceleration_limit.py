@@ -38,8 +38,6 @@ TurnAccelerationLimit = declare(
     rank=3,
     kinds=SIDES,
     needs=(Excitation.CHANGES, Excitation.LARGE, Excitation.TURNING),
-    confused_with=("acceleration_limit", "wheel_servo", "turn_lag"),
-    same_in_one_motion=("acceleration_limit",),
     is_degenerate=is_short("turn"),
     list_usual=take_largest("turn"),
 )

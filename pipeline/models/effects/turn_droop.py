@@ -69,8 +69,6 @@ TurnDroop = declare(
     rank=40,
     kinds=SIDES,
     needs=(Excitation.LARGE, Excitation.TURNING),
-    confused_with=("effective_track", "difference_gain", "wheel_speed_limit", "body_turn_limit"),
-    contains=("effective_track", "difference_gain"),
     is_degenerate=_is_gain_or_limit,
     list_usual=_list_usual,
 )

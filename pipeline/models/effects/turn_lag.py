@@ -33,9 +33,6 @@ TurnLag = declare(
     rank=30,
     kinds=SIDES,
     needs=(Excitation.CHANGES, Excitation.TURNING),
-    confused_with=("drive_lag", "transport_delay", "turn_droop"),
-    same_in_one_motion=("drive_lag",),
-    contains=("drive_lag",),
     is_degenerate=are_equal(0.08, 0.02),
     collapse=to_one_lag,
 )

@@ -22,5 +22,4 @@ TurningResistance = declare(
         one_sign=True,
     ),
     needs=(Excitation.TURNING, Excitation.SPEED_SPREAD),
-    confused_with=("speed_slip", "wheel_radius"),
 )

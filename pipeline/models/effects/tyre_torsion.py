@@ -56,7 +56,6 @@ class TyreTorsion(BodyEffect):
         {"tau": 0.25, "damping": 0.3},
     )
     needs = (Excitation.CHANGES, Excitation.TURNING)
-    confused_with = ("body_inertia", "heading_skew")
 
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""

@@ -23,5 +23,4 @@ Understeer = declare(
     rank=40,
     kinds=ACKERMANN,
     needs=(Excitation.SPEED_SPREAD, Excitation.STEERING),
-    confused_with=("steering_gain",),
 )

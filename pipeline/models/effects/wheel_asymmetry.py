@@ -26,5 +26,4 @@ WheelAsymmetry = declare(
     rank=10,
     kinds=("differential", "mecanum"),
     needs=(Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD),
-    confused_with=("yaw_drift", "lever_arm", "icr_lateral"),
 )

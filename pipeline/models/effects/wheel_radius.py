@@ -40,7 +40,6 @@ WheelRadius = declare(
     scale_role="radius",
     rank=30,
     needs=(Excitation.SPEED_SPREAD,),
-    confused_with=("speed_slip", "effective_track"),
     readings=(
         Reading(Level.VEHICLE, "wheel_radius", "a wrong wheel radius"),
         Reading(Level.TERRAIN, "longitudinal_slip", "longitudinal slip"),

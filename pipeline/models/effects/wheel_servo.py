@@ -171,15 +171,6 @@ class WheelServo(JointDrive):
         {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
-    confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
-    contains = ("deadband", "load_droop", "turn_lag", "difference_gain")
-    companions = (
-        "transport_delay",
-        "body_turn_limit",
-        "body_acceleration_limit",
-        "turn_acceleration_limit",
-        "wheel_speed_limit",
-    )
 
     def list_starts(self, largest: Largest) -> list[dict[str, float]]:
         """The starts, and the same with speeds in proportion to the fastest rim where it is another one."""

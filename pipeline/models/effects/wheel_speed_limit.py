@@ -40,8 +40,5 @@ WheelSpeedLimit = declare(
     rank=4,
     kinds=WHEELED,
     needs=(Excitation.LARGE,),
-    confused_with=("body_speed_limit", "body_turn_limit", "wheel_speed_scaling"),
-    same_at_one_speed=("drive_gain", "wheel_servo", "wheel_radius"),
-    same_in_one_motion=("wheel_speed_scaling",),
     is_degenerate=never_attained,
 )

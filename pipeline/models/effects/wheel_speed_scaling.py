@@ -18,9 +18,6 @@ WheelSpeedScaling = declare(
     rank=4,
     kinds=("differential", "mecanum"),
     needs=(Excitation.LARGE, Excitation.TURNING),
-    confused_with=("wheel_speed_limit", "body_speed_limit", "body_turn_limit"),
-    same_at_one_speed=("drive_gain", "wheel_servo", "wheel_radius"),
-    same_in_one_motion=("wheel_speed_limit",),
     can_show=has_encoders,
     is_degenerate=never_attained,
 )

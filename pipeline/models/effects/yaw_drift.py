@@ -14,5 +14,4 @@ YawDrift = declare(
     "v_w += c * turning",
     Parameter("c", "rad/s", (-0.5, 0.5), 0.0, "yaw rate to the left", 0.06),
     needs=(Excitation.BOTH_SIGNS,),
-    confused_with=("wheel_asymmetry", "steering_offset"),
 )

@@ -24,7 +24,6 @@ YawMisalignment = declare(
     ),
     rank=20,
     needs=(Excitation.BOTH_SIGNS,),
-    confused_with=("lateral_drift",),
     readings=(
         Reading(Level.VEHICLE, "yaw_misalignment", "a misaligned sensor or a bent axle"),
         Reading(Level.TERRAIN, "crabbing", "crabbing on this terrain"),

@@ -25,5 +25,4 @@ YawPull = declare(
     rank=10,
     kinds=("mecanum", "omni"),
     needs=(Excitation.BOTH_SIGNS, Excitation.SPEED_SPREAD),
-    confused_with=("wheel_asymmetry", "yaw_drift"),
 )
