@@ -123,7 +123,7 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
     turn = measure_commanded_turn(run, model.vehicle)
     if turn is not None:
         estimates[COMMANDED_TURN] = (math.log(turn.share), turn.deviation)
-        estimates[MULTIPLIER] = (math.log(turn.multiplier), _MULTIPLIER_ERROR)
+        estimates[MULTIPLIER] = (math.log(turn.controller_multiplier), _MULTIPLIER_ERROR)
     return RunReading(run.name, run.terrain, pace, estimates)
 
 

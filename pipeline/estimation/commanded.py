@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import results
 from pipeline.core import (
     FEWEST_OF_SPREAD,
     NORMAL_95,
@@ -30,6 +28,7 @@ from pipeline.core import (
 from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import locate_windows
 from pipeline.models import Timing
+from pipeline.results import CommandedTurn
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 
@@ -45,26 +44,6 @@ _LEAST_SHARE, _MOST_SHARE = 0.02, 50.0
 """Range of a share that means anything."""
 
 
-@dataclass(frozen=True)
-class CommandedTurn:
-    """Share of the commanded yaw rate that a robot reaches.
-
-    Attributes:
-        share: measured over commanded yaw rate; after a lag and a dead time.
-        deviation: standard deviation of its logarithm.
-        multiplier: yaw rate of the commanded wheels at the nominal track over that of the body command.
-    """
-
-    share: float
-    deviation: float
-    multiplier: float
-
-    def as_result(self) -> results.CommandedTurn:
-        """The share with its 95 % interval."""
-        factor = math.exp(NORMAL_95 * self.deviation)
-        return results.CommandedTurn(self.share, self.share / factor, self.share * factor, self.multiplier)
-
-
 def measure_commanded_turn(run: MotionRun, vehicle: Vehicle) -> CommandedTurn | None:
     """Measure the share of the commanded yaw rate that a run reaches.
 
@@ -78,7 +57,8 @@ def measure_commanded_turn(run: MotionRun, vehicle: Vehicle) -> CommandedTurn | 
     with contextlib.suppress(SlipError):
         gained = _measure_gain(RunResiduals(run, vehicle, Input.COMMAND))
         if gained is not None and _LEAST_SHARE < multiplier * gained[0] < _MOST_SHARE:
-            return CommandedTurn(multiplier * gained[0], gained[1], multiplier)
+            share, factor = multiplier * gained[0], math.exp(NORMAL_95 * gained[1])
+            return CommandedTurn(share, share / factor, share * factor, multiplier)
     return None
 
 

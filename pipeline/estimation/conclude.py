@@ -236,7 +236,6 @@ def of_run(
     for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
         (late,) = clock.parameters.values()
         delays = replace(delays, pose_delay_s=round(late.value, 4))
-    turn = measure_commanded_turn(data.runs[number], data.vehicle)
     return replace(
         common,
         run=recording.name,
@@ -244,7 +243,7 @@ def of_run(
         findings=(*common.findings, *note_brevity(data, common), *recording.list_findings()),
         timing=delays,
         when=tuple(one for one in common.when if one.run == number),
-        commanded_turn=None if turn is None else turn.as_result(),
+        commanded_turn=measure_commanded_turn(data.runs[number], data.vehicle),
     )
 
 

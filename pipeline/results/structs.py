@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 import msgspec
 from msgspec.structs import replace
 
-from pipeline.core import round_numbers
+from pipeline.core import NORMAL_95, round_numbers
 from pipeline.models import Number, split_determined
 from pipeline.recording import Finding
 from pipeline.sources import Vehicle
@@ -403,6 +403,11 @@ class CommandedTurn(msgspec.Struct, frozen=True):
     low: float
     high: float
     controller_multiplier: float
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the logarithm of the share."""
+        return math.log(self.high / self.share) / NORMAL_95
 
 
 class DataNeed(msgspec.Struct, frozen=True):
