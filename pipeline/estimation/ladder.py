@@ -274,7 +274,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     """
     fitted = assessment.fitted.model
     model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
-    kept = {label: one for label, one in file.numbers.items() if label.partition(".")[0] not in fitted.ids}
+    others = {label: one for label, one in file.numbers.items() if label.partition(".")[0] not in fitted.ids}
     data, estimates = assessment.data, assessment.estimates
     fit: dict[str, object] = {
         "input": data.source.value,
@@ -322,7 +322,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
         ids = set(model.ids)
         undecided = [group for group in file.undecided if ids.intersection(group)]
         fit |= {key: rows for key, rows in (("undecided", undecided),) if rows}
-    return replace(file, model=model, per_run=per_run, numbers=kept | assessment.numbers, fit=fit)
+    return replace(file, model=model, per_run=per_run, numbers=others | assessment.numbers, fit=fit)
 
 
 def _measure_driven(data: EstimationData) -> list[dict[str, float]]:
