@@ -16,7 +16,7 @@ from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, Loss
 from pipeline.recording import POSE_FINDINGS, Finding, Given, extract_tables
 from pipeline.recording.log_setup import LogSetup
-from pipeline.run import Alignment, MotionError, read_alignment, read_drive
+from pipeline.run import Alignment, MotionError, read_alignment, read_wheels
 from pipeline.sources import Vehicle, describe_types
 from pipeline.stages import align_tables, checks, slip_stage, velocity
 from pipeline.store import (
@@ -259,7 +259,7 @@ class Work:
             self.alignment,
             self.setup.configuration.velocity,
             where=str(self.setup.path),
-            wheels=read_drive(self._read("wheels"), self.vehicle),
+            wheels=read_wheels(self._read("wheels"), self.vehicle),
         )
         self.write("velocities", made.table)
         return StageOutcome(made.findings)
@@ -358,7 +358,7 @@ def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 21, "velocity": 7, "slip": 22, "aggregate": 4}
+VERSIONS: Mapping[str, int] = {"extract": 22, "velocity": 7, "slip": 22, "aggregate": 4}
 
 
 EXTRACTED = ("commands", "wheels", "poses", "imu")

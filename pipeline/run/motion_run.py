@@ -82,6 +82,10 @@ class GyroFit:
         """Integrated angle of the gyro [rad] from its rate [rad/s] at times [s], shape (n,)."""
         return self.signed_scale * arrays.integrate_rate(times, rate) + self.bias * times
 
+    def turn_until(self, at: Floats, gyro: tuple[Floats, Floats]) -> Floats:
+        """That angle at times of the poses [s], shape (m,)."""
+        return np.interp(at - self.yaw_delay_s, gyro[0], self.turn(*gyro))
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -274,27 +278,13 @@ def load_run(
     if table is None or table.is_empty():
         what = "the results have no table alignments"
         raise MotionError("not_aligned", what, where=name, hint="Analyze the log again with --force.")
-    return make_run(tables, vehicle, read_alignment(table), name=name, sha256=sha256)
-
-
-def make_run(
-    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, *, name: str, sha256: str = ""
-) -> MotionRun:
-    """As `load_run`, with an alignment that is not yet stored.
-
-    Raises:
-        MotionError: ``no_poses``.
-    """
-    commands = read_drive(tables.get("commands"), vehicle)
-    wheels = read_drive(tables.get("wheels"), vehicle)
-    track = _read_track(tables["poses"], wheels, name)
-    if wheels is not None and find_fastest_wheel(wheels).max() < _DEAD:
-        wheels = None
-    imu = tables.get("imu")
-    gyro = None
-    if imu is not None and not imu.is_empty():
-        late = 0.0 if alignment.gyro is None else alignment.gyro.moved_s
-        gyro = _distinct(imu["t"].to_numpy() - late, imu["rate_z"].to_numpy())
+    alignment = read_alignment(table)
+    commands, wheels = (
+        _read_drive(tables.get("commands"), vehicle),
+        read_wheels(tables.get("wheels"), vehicle),
+    )
+    track = read_track(tables["poses"], wheels, name=name)
+    gyro = read_gyro(tables.get("imu"), alignment.gyro)
     stamps = [tables["poses"]["t"].to_numpy(), *(d.times for d in (commands, wheels) if d is not None)]
     streams = np.unique(np.concatenate(stamps))
     if commands is not None and alignment.hold_s is not None:
@@ -374,7 +364,17 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
     return tabulate("alignments", [row])
 
 
-def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
+def read_track(poses: pl.DataFrame, wheels: DriveSeries | None, *, name: str) -> Track:
+    """Poses of table `poses` with new information, in the plane of motion.
+
+    Args:
+        poses: with the column `latency` at the times to which they belong, else at their stamps.
+        wheels: measured wheels, which tell a localization that waits from a vehicle at rest.
+        name: of the run, for error messages.
+
+    Raises:
+        MotionError: ``no_poses``.
+    """
     parts: list[Track] = []
     for piece in rigid.cut_segments(poses):
         fresh = select_fresh(piece, wheels)
@@ -439,7 +439,13 @@ def read_wheel_times(table: pl.DataFrame) -> Floats:
     return times - table["latency"].to_numpy() if "latency" in table.columns else times
 
 
-def read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
+def read_wheels(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
+    """Measured wheels of table `wheels`; None where there are none, or if they never move."""
+    wheels = _read_drive(table, vehicle)
+    return None if wheels is None or find_fastest_wheel(wheels).max() < _DEAD else wheels
+
+
+def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
     """Commands or measured wheels; None where there are none."""
     if table is None or table.is_empty():
         return None
@@ -463,6 +469,14 @@ def read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | No
     if mask.sum() < 2:  # noqa: PLR2004 - one value is no series
         return None
     return DriveSeries(times[mask], left[mask], right[mask], steering[mask], sideways)
+
+
+def read_gyro(imu: pl.DataFrame | None, fit: GyroFit | None = None) -> tuple[Floats, Floats] | None:
+    """Times [s] and yaw rates [rad/s] of a gyro as recorded, on the clock of a fit to the poses."""
+    if imu is None or imu.is_empty():
+        return None
+    late = 0.0 if fit is None else fit.moved_s
+    return _distinct(imu["t"].to_numpy() - late, imu["rate_z"].to_numpy())
 
 
 def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ They are estimated once, from commands, wheels, poses and gyro as extracted, and
 tables and as numbers, so that every reader of the run gets corrected data.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -20,17 +20,19 @@ from pipeline.run import (
     DriveSeries,
     GyroFit,
     MotionError,
-    MotionRun,
+    Track,
     align_heading,
-    fit_gyro,
     has_excluded,
-    make_run,
     mark_excluded,
     name_inputs,
+    read_gyro,
+    read_track,
+    read_wheels,
     tabulate_alignment,
 )
 from pipeline.sources import Vehicle, VelocitySection
 from pipeline.stages.drive_numbers import mark_late_starts
+from pipeline.stages.gyro import fit_gyro
 from pipeline.stages.inputs import interpolate_wheels, usual_hold
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import LEAST_CORRELATION, estimate_delay
@@ -251,69 +253,70 @@ _ROUNDS = 10
 """Reweighting iterations, as in `fit_robustly`."""
 _BINS = 6
 """Classes of speed of equal size, at least 33 displacements in each."""
-SAMPLE_S = 0.05
-"""Step of the times at which a localization is at fault [s]: that of the grid."""
-_ROUNDING = 1e-6
-"""Tolerance relative to a step, so that times on the raster stay on it."""
+_BESIDE_S = 0.05
+"""Time before and after a displacement that is at fault with it [s]: the step of the grid."""
 
 
-def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
-    """Times at which the localization is at fault [s], at 20 Hz.
+def find_outliers(
+    track: Track, heading: Floats, at: Floats, wheels: DriveSeries, vehicle: Vehicle, excluded: Floats
+) -> list[tuple[float, float]]:
+    """Starts and ends of spans in which the localization is at fault [s], in order.
 
-    Without measured wheels the vehicle's motion is unknown, and there are none.
+    Args:
+        track: the poses, shape (n,).
+        heading: of the gyro if there is a good one, else of the poses [rad], shape (n,).
+        at: times of the poses on the clock of the wheels [s], shape (n,).
+        wheels: measured; without them the vehicle's motion is unknown.
+        vehicle: geometry.
+        excluded: times [s] that are not compared, increasing.
     """
-    none = np.zeros(0)
-    if run.wheels is None:
-        return none
-    first, last = _pair_up(run)
+    first, last = _pair_up(track, excluded)
     if first.size < _FEWEST:
-        return none
-    off = _measure_misfit(run, run.wheels, vehicle, first, last)
-    begin, end = run.track.times[first], run.track.times[last]
-    live = np.diff(run.track.times)[run.track.active[1:]]
+        return []
+    off = _measure_misfit(track, heading, at, wheels, vehicle, first, last)
+    begin, end = track.times[first] - _BESIDE_S, track.times[last] + _BESIDE_S
+    live = np.diff(track.times)[track.active[1:]]
     most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
     faulty = off > 1.0
-    grid = _fill(begin[faulty], end[faulty], run.start_s)
+    spans = _join(begin[faulty], end[faulty])
     # More than a twentieth is not an exception: then only the worst part counts as a fault.
-    while grid.size * SAMPLE_S > most:
+    while np.diff(spans).sum() > most:
         faulty &= off > np.quantile(off[faulty], 0.1)
-        grid = _fill(begin[faulty], end[faulty], run.start_s)
-    return grid
+        spans = _join(begin[faulty], end[faulty])
+    return [(start, stop) for start, stop in spans.tolist()]
 
 
-def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
-    """Times throughout some intervals, at 20 Hz since ``origin``."""
-    first = np.floor((begin - origin) / SAMPLE_S + _ROUNDING)
-    last = np.ceil((end - origin) / SAMPLE_S - _ROUNDING)
-    ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    return origin + np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
+def _join(begin: Floats, end: Floats) -> Floats:
+    """Union of some intervals in the order of their starts, shape (k, 2)."""
+    until = np.maximum.accumulate(end)
+    first = np.append(True, begin[1:] > until[:-1])[: begin.size]
+    return np.column_stack((begin[first], until[np.append(first[1:], True)[: begin.size]]))
 
 
-def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
+def _pair_up(track: Track, excluded: Floats) -> tuple[Ints, Ints]:
     """Poses of one segment half a second apart, and those before and after a longer wait."""
-    times = run.track.times
+    times = track.times
     first = np.arange(times.size)
     last = np.searchsorted(times, times + SPAN_S - 1e-3)
     mask = last < times.size
     first, last = first[mask], last[mask].astype(np.int64)
-    mask = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
-    mask &= run.track.active[first] & run.track.active[last]
-    mask &= ~has_excluded(run.excluded, times[first], times[last])
+    mask = (track.segment[first] == track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
+    mask &= track.active[first] & track.active[last] & ~has_excluded(excluded, times[first], times[last])
     return first[mask], last[mask]
 
 
-def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints) -> Floats:
+def _measure_misfit(
+    track: Track, heading: Floats, at: Floats, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints
+) -> Floats:
     """Distance of each displacement from the robust model, one at the threshold of a fault, shape (n,)."""
-    track = run.track
-    heading, delay = _choose_heading(run)
     moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
     span = track.times[last] - track.times[first]
     forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
 
     def drive(rate: Floats, late: float) -> Floats:
         driven = arrays.integrate_rate(wheels.times, rate)
-        at = track.times - delay - late
-        return np.interp(at[last], wheels.times, driven) - np.interp(at[first], wheels.times, driven)
+        until = np.interp(at - late, wheels.times, driven)
+        return until[last] - until[first]
 
     own = (heading[last] - heading[first]) / span
     along = [drive(forward, late) for late in _LAGS_S]
@@ -332,18 +335,6 @@ def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first
     size = np.hypot(gap[:, 0], gap[:, 1])
     usual = _spread_by_speed(size, speed / span)
     return size / np.maximum(_FAR * usual, _LEAST_M)
-
-
-def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
-    """Heading at the poses, of the gyro if there is a good one, and the delay of the poses [s]."""
-    gyro = run.gyro_fit
-    if gyro is None or run.gyro is None:
-        return run.track.heading, 0.0
-    times, rate = run.gyro
-    angle = gyro.turn(times, rate)
-    seen = np.interp(run.track.times - gyro.yaw_delay_s, times, angle)
-    good = ~mark_excluded(run, run.track.times)
-    return seen + align_heading(run.track, run.track.heading - seen, good), gyro.yaw_delay_s
 
 
 def _fit_robustly(columns: Floats, values: Floats) -> Floats:
@@ -374,9 +365,6 @@ def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
 
 # Correction of the poses: their latency against the gyro, and the outliers among them.
 
-_BESIDE = 0.6
-"""Distance of a pose to a fault, in `SAMPLE_S`, at which it is affected: over a half, to cover all poses."""
-
 
 def align_poses(
     tables: Mapping[str, pl.DataFrame],
@@ -399,59 +387,70 @@ def align_poses(
     """
     poses = tables["poses"]
     times = poses["t"].to_numpy()
-    latency, outlier = np.zeros(times.size), np.zeros(times.size, dtype=bool)
+    gyro, wheels = read_gyro(tables.get("imu")), read_wheels(tables.get("wheels"), vehicle)
+    excluded, own, outliers = times[~is_live], np.zeros(times.size), list[tuple[float, float]]()
     try:
-        run = make_run(tables, vehicle, alignment, name=where)
+        stamped = read_track(poses, wheels, name=where)
     except MotionError:
         # A log without enough data for a model still has slip.
-        return _correct_poses(poses, latency, outlier), alignment
-    run = replace(run, excluded=times[~is_live])
+        return _correct_poses(poses, own, own > 0.0), alignment
     if not is_localization:
         # Integrated wheels have no clock of their own.
-        return _correct_poses(poses, latency, outlier), _take_off_delay(_with_gyro(run).alignment, 0.0)
-    raw = run.track.times
-    own, spread = estimate_latency(run)
-    run = replace(run, track=replace(run.track, times=raw - own))
-    run = _with_gyro(run)
-    at_fault = find_outliers(run, vehicle)
-    if at_fault.size:
-        near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
-        outlier |= near
-        run = _with_gyro(replace(run, excluded=np.union1d(run.excluded, at_fault)))
-    late, moved = _split_delay(run)
-    for segment in np.unique(run.track.segment).tolist():
-        rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
-        latency[rows] = late + np.interp(times[rows], raw[known], own[known])
-    alignment = _take_off_delay(run.alignment, late, moved)
-    alignment = replace(alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
-    return _correct_poses(poses, latency, outlier), alignment
+        fit = fit_gyro(stamped, gyro, excluded)
+        return _correct_poses(poses, own, own > 0.0), replace(alignment, gyro=_put_on_clock(fit))
+    ages, spread = estimate_latency(stamped, gyro, excluded)
+    for segment in np.unique(stamped.segment).tolist():
+        rows, known = poses["segment"].to_numpy() == segment, stamped.segment == segment
+        own[rows] = np.interp(times[rows], stamped.times[known], ages[known])
+    track = replace(stamped, times=stamped.times - ages)
+    fit = fit_gyro(track, gyro, excluded)
+    if wheels is not None:
+        heading, late = track.heading, 0.0
+        if fit is not None and gyro is not None:
+            seen, late = fit.turn_until(track.times, gyro), fit.yaw_delay_s
+            heading = seen + align_heading(track, heading - seen, ~mark_excluded(excluded, track.times))
+        outliers = find_outliers(track, heading, track.times - late, wheels, vehicle, excluded)
+    if outliers:
+        at_fault = track.times[_mark(track.times, outliers)]
+        fit = fit_gyro(track, gyro, np.union1d(excluded, at_fault))
+    late, moved = _split_delay(fit, gyro)
+    found = replace(
+        alignment,
+        gyro=_put_on_clock(fit, moved),
+        heading_delay_s=late,
+        latency_spread_s=spread,
+        outlier_s=sum(end - begin for begin, end in outliers),
+    )
+    outlier = _mark(times - own, outliers)
+    return _correct_poses(poses, own + late, outlier), found
+
+
+def _mark(times: Floats, spans: Sequence[tuple[float, float]]) -> Flags:
+    """Times in some spans, shape (n,)."""
+    inside = np.zeros(times.size, dtype=bool)
+    for begin, end in spans:
+        inside |= (times >= begin) & (times <= end)
+    return inside
 
 
 def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
     return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
 
 
-def _split_delay(run: MotionRun) -> tuple[float, float]:
+def _split_delay(fit: GyroFit | None, gyro: tuple[Floats, Floats] | None) -> tuple[float, float]:
     """Delay of the poses against the gyro, and of the gyro against the poses [s]; one of them is zero.
 
     Between two samples the time at which the gyro's rate changed is unknown: if commands and samples are
     synchronous, the gyro appears late by a constant part of half a sampling period. A delay up to this does
     not concern the poses' clock.
     """
-    if run.gyro_fit is None or run.gyro is None:
+    if fit is None or gyro is None:
         return 0.0, 0.0
-    late = run.gyro_fit.yaw_delay_s
-    unknown = 0.5 * float(np.median(np.diff(run.gyro[0]))) + NORMAL_95 * run.gyro_fit.delay_error_s
+    late = fit.yaw_delay_s
+    unknown = 0.5 * float(np.median(np.diff(gyro[0]))) + NORMAL_95 * fit.delay_error_s
     return (late, 0.0) if abs(late) > unknown else (0.0, -late)
 
 
-def _take_off_delay(alignment: Alignment, late: float, moved: float = 0.0) -> Alignment:
-    """The alignment of poses and a gyro on one clock."""
-    gyro = alignment.gyro
-    if gyro is not None:
-        gyro = replace(gyro, yaw_delay_s=0.0, moved_s=moved)
-    return replace(alignment, gyro=gyro, heading_delay_s=late)
-
-
-def _with_gyro(run: MotionRun) -> MotionRun:
-    return replace(run, alignment=replace(run.alignment, gyro=fit_gyro(run)))
+def _put_on_clock(fit: GyroFit | None, moved: float = 0.0) -> GyroFit | None:
+    """The fit of a gyro to poses on its own clock."""
+    return None if fit is None else replace(fit, yaw_delay_s=0.0, moved_s=moved)

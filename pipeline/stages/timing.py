@@ -19,7 +19,8 @@ from pipeline.core import (
     join_parts,
     robust_spread,
 )
-from pipeline.run import GyroFit, MotionRun, Track, align_heading, fit_gyro, mark_excluded
+from pipeline.run import Track, align_heading, mark_excluded
+from pipeline.stages.gyro import fit_gyro
 
 # Age of each pose: poses are shifted to the times of measurement, from gyro headings and from the path.
 #
@@ -47,6 +48,8 @@ _FEWEST = 200
 the recording on grass of 2024-07-29 gets latencies of its poses."""
 _TURNING = 0.3
 """Yaw rate [rad/s] above which a heading determines a time: noise of 2 mrad is 7 ms."""
+_BESIDE_S = 0.05
+"""Half of the time over which the gyro's yaw rate at a pose is taken [s]."""
 _STRAIGHT = 0.05
 """Yaw rate [rad/s] below which the heading shows its noise and not its age: 0.1 s of age are 5 mrad."""
 _OLDEST = 0.5
@@ -109,23 +112,32 @@ class _Seen:
     telling: Flags
 
 
-def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
-    """Latency of every pose of a run's track relative to their common latency, and its variation.
+def estimate_latency(
+    track: Track, gyro: tuple[Floats, Floats] | None, excluded: Floats
+) -> tuple[Floats, float]:
+    """Latency of every pose of a track relative to their common latency, and its variation.
 
     It is zero without a gyro that agrees with the poses, with little turning, or if the ages of the poses
     vary by less than 15 ms: then the stamps are as accurate as the gyro can show.
 
+    Args:
+        track: the poses at their stamps, shape (n,).
+        gyro: times [s] and yaw rates [rad/s]; None without one.
+        excluded: times [s] that are not compared, increasing.
+
     Returns:
         Latencies [s] in the order of the poses, shape (n,), and their standard deviation in turns [s].
     """
-    track, ages = run.track, np.zeros(run.track.times.size)
-    nothing, spread = (np.zeros(ages.size), 0.0), 0.0
+    ages, spread = np.zeros(track.times.size), 0.0
+    nothing = np.zeros(ages.size), 0.0
+    good = ~mark_excluded(excluded, track.times) & track.active
     for _ in range(_ROUNDS):
-        moved = replace(run, track=replace(track, times=_take_off(track, ages)))
-        gyro = fit_gyro(moved)
-        if gyro is None:
+        moved = replace(track, times=_take_off(track, ages))
+        fit = fit_gyro(moved, gyro, excluded)
+        if fit is None or gyro is None:
             return nothing
-        seen = _look(run, moved.track, gyro, ages)
+        before, angle, after = (fit.turn_until(moved.times + by, gyro) for by in (-_BESIDE_S, 0.0, _BESIDE_S))
+        seen = _look(track, angle, (after - before) / (2.0 * _BESIDE_S), ages, good)
         if seen.telling.sum() < _FEWEST:
             return nothing
         ages, spread = _estimate(track, seen, ages)
@@ -134,20 +146,23 @@ def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
     return track.times - _take_off(track, ages), spread
 
 
-def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
-    """Compare reported headings with the gyro's at the times given by the current ages."""
-    times, rate = run.gyro if run.gyro is not None else (np.zeros(0), np.zeros(0))
-    angle = gyro.turn(times, rate)
-    at = track.times - gyro.yaw_delay_s
-    turning = (np.interp(at + 0.05, times, angle) - np.interp(at - 0.05, times, angle)) / 0.1
-    difference = track.heading - np.interp(at, times, angle)
-    good = ~mark_excluded(run, run.track.times) & track.active
-    rest = difference - align_heading(run.track, difference, good)
+def _look(track: Track, angle: Floats, turning: Floats, ages: Floats, good: Flags) -> _Seen:
+    """Compare reported headings with the gyro's at the times given by the current ages.
+
+    Args:
+        track: the poses at their stamps, shape (n,).
+        angle: of the gyro at these times [rad], shape (n,).
+        turning: its yaw rate [rad/s], shape (n,).
+        ages: of the poses [s], shape (n,).
+        good: poses to use, shape (n,).
+    """
+    difference = track.heading - angle
+    rest = difference - align_heading(track, difference, good)
     straight = good & (np.abs(turning) < _STRAIGHT)
     noise = robust_spread(rest[straight]) if straight.any() else _NOISE[1]
     safe = np.where(np.abs(turning) > 1e-3, turning, np.inf)  # noqa: PLR2004 - no age without turning
     age = ages - rest / safe
-    good &= np.abs(age) < _OLDEST
+    good = good & (np.abs(age) < _OLDEST)
     return _Seen(
         age, turning, float(np.clip(noise, *_NOISE)), good, np.asarray(good & (np.abs(turning) > _TURNING))
     )

@@ -11,8 +11,8 @@ from pipeline.estimation import EstimationData, Input, fit_model, hold_out
 from pipeline.estimation.floor import estimate_floor
 from pipeline.models import Model
 from pipeline.run import load_run
-from pipeline.run.heading import fit_gyro
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Program, simulate_run
+from pipeline.stages.gyro import fit_gyro
 
 HUSKY = vehicle_of("husky_a200")
 
@@ -35,7 +35,7 @@ def test_a_gyro_that_fell_silent_is_no_heading(
     tables: Mapping[str, pl.DataFrame], heard: pl.Expr, *, is_heading: bool
 ) -> None:
     run = load_run({**tables, "imu": tables["imu"].filter(heard)}, HUSKY, name="gyro")
-    assert (fit_gyro(run) is not None) == is_heading
+    assert (fit_gyro(run.track, run.gyro, run.excluded) is not None) == is_heading
 
 
 def test_steps_of_the_command_are_no_faults_of_the_localization() -> None:

@@ -19,7 +19,7 @@ from stage_logs import FIELD, Taken, TakeThrough, keep_good_rows, record
 from pipeline.analysis.work import as_recorded
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.recording.clocks import Recorded, align_clocks
-from pipeline.run import Alignment, read_drive
+from pipeline.run import Alignment, read_wheels
 from pipeline.simulate import Clock, Scenario
 from pipeline.stages.align import align_tables
 from pipeline.stages.slip_stage import compute_slip
@@ -118,7 +118,7 @@ def find_effects(taken: Taken, tables: dict[str, pl.DataFrame]) -> tuple[set[str
         aligned.alignment,
         taken.configuration.velocity,
         where="test",
-        wheels=read_drive(tables["wheels"], vehicle),
+        wheels=read_wheels(tables["wheels"], vehicle),
     )
     tables["slip"] = compute_slip(
         motion.table,

@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from few import few
 
-from pipeline.run import Alignment, make_run
+from pipeline.run import Alignment, load_run, tabulate_alignment
 from pipeline.sources import Vehicle, find_preset
 from pipeline.stages.drive_numbers import mark_late_starts, measure_responses
 from pipeline.words import format_finding
@@ -154,8 +154,9 @@ def test_models_get_no_command_before_the_drive_followed_it(vehicle: Vehicle) ->
     lateness = np.array([0.0, 0.35, 0.0, 0.8, 0.0, 0.2, 0.0, 0.0])
     commands, wheels, starts = drive(1, lateness)
     marked, _ = mark_late_starts(commands, wheels, vehicle)
-    tables = {"commands": marked, "wheels": wheels, "poses": make_poses(commands["t"])}
-    run = make_run(tables, vehicle, Alignment(), name="run")
+    aligned = tabulate_alignment(Alignment())
+    tables = {"commands": marked, "wheels": wheels, "poses": make_poses(commands["t"]), "alignments": aligned}
+    run = load_run(tables, vehicle, name="run")
     late = starts[3]
     between = (run.commands.times >= late) & (run.commands.times < late + 0.7)
     assert not between.any()
@@ -169,6 +170,7 @@ def test_a_short_gap_and_a_late_start_put_no_stop_into_the_commands(vehicle: Veh
         lost |= (commands["t"].to_numpy() >= start - 0.3) & (commands["t"].to_numpy() < start)
     marked, findings = mark_late_starts(commands.filter(pl.Series(~lost)), wheels, vehicle)
     assert findings
-    tables = {"commands": marked, "wheels": wheels, "poses": make_poses(commands["t"])}
-    run = make_run(tables, vehicle, Alignment(hold_s=0.5), name="run")
+    aligned = tabulate_alignment(Alignment(hold_s=0.5))
+    tables = {"commands": marked, "wheels": wheels, "poses": make_poses(commands["t"]), "alignments": aligned}
+    run = load_run(tables, vehicle, name="run")
     assert np.count_nonzero(run.commands.left[:-1] == 0.0) == 0

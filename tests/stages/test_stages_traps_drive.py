@@ -10,7 +10,7 @@ from stage_logs import FIELD, ICP, PLAIN, TakeThrough, rms, slope
 from pipeline.core import SlipError
 from pipeline.recording.command_scale import find_ratio
 from pipeline.recording.drive import _mean_steering
-from pipeline.run import read_drive
+from pipeline.run import read_wheels
 from pipeline.simulate import VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.words import format_finding
 
@@ -144,7 +144,7 @@ def test_trap_9_commands_in_place_of_encoders_are_not_evaluated_and_still_show_o
     assert taken.finding("wheels_from_commands").severity == "warning"
     assert "pose_from_wheels" not in taken.ids()
     assert set(taken.result.inputs) == {"command"}
-    assert read_drive(taken.aligned.tables["wheels"], taken.aligned.vehicle) is None
+    assert read_wheels(taken.aligned.tables["wheels"], taken.aligned.vehicle) is None
     assert {"wheels_from_commands", "pose_from_wheels"} <= drive(replace(echo, pose=ODOMETRY)).ids()
     assert "wheels_from_commands" not in drive(replace(echo, effects={"drive_lag": 0.02})).ids()
     with pytest.raises(SlipError, match="--input command"):
