@@ -238,7 +238,7 @@ class Case:
             signals = (_hold(table, name, may_stand=not is_measured) for name in names)
             return Reading("body", str(source), *signals)
         if unit.kind == "ackermann":
-            speed = _hold(table, "speed")
+            speed = _hold(table, "speed", may_stand=not is_measured)
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else NO_SIGNAL
             return Reading("steering", str(source), speed, bent)
         names = ("left", "right", *(["sideways"] if self.moves_sideways else []))

@@ -348,11 +348,17 @@ def find_pose_unit(commanded: float | None, rolled: float | None, radius: float 
 
 _LENGTH = (0.8, 1.0)
 """Usual wheelbase [m], and the spread of its logarithm: models of a hand's length to lorries."""
+_WHEELBASES_M = (0.05, 30.0)
+"""Wheelbases [m] that vehicles have."""
+_IMPOSSIBLE = 1e3
+"""Surprise of another one [nats]: more than a limit of the steering, say, may take from a good fit."""
 
 
 def _rate_wheelbase(length: float | None, known: float | None) -> float:
     """Log-likelihood of a wheelbase [m] by the motion, against a known one or the usual ones."""
     middle, spread = (known, 0.35) if known else _LENGTH
+    if length and not _WHEELBASES_M[0] < length < _WHEELBASES_M[1]:
+        return -_IMPOSSIBLE
     apart = 2.0 if not length else np.log(length / middle) / spread
     return float(-0.5 * min(apart**2, 40.0) - np.log(spread))
 

@@ -147,6 +147,7 @@ class Bent(Held):
         self._sums = {}
         self._speed = speed
         self.moves = speed.moves and self._angle.moves
+        self.is_constant = speed.is_constant and self._angle.is_constant
         if self.moves:
             at = np.searchsorted(
                 self._angle.times, self._start + GRID_S * np.arange(speed.grid.size), side="right"

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.core import Floats
 from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
 from pipeline.recording.findings import Finding
-from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit, measure_motion
+from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit, measure_motion, measure_share
 from pipeline.recording.readings import DELAYS_S, Reading
 from pipeline.sources import PoseContent
 
@@ -241,6 +242,8 @@ _LEAST_RAD = 0.01
 """Least angle [rad] that is told: half a degree, as a sensor is mounted by hand."""
 _LEAST_M = 0.02
 """Least distance [m] that is told, as a sensor's place is measured by hand."""
+_TOGETHER = 0.98
+"""Share of a cause that others make up, from which on nothing tells them apart, as at one speed."""
 
 
 def ask_mounting(case: Case) -> Case:
@@ -257,7 +260,7 @@ def ask_mounting(case: Case) -> Case:
     columns = np.column_stack([ahead, motion.yaw, ahead / elapsed * motion.yaw])
     made = fit(motion.body.imag, columns, motion.steps)
     (angle, lever, _), (of_angle, of_lever, _) = made.gains.tolist(), made.t.tolist()
-    if abs(of_angle) > CLEAR and abs(angle) > _LEAST_RAD:
+    if abs(of_angle) > CLEAR and abs(angle) > _LEAST_RAD and _is_apart(columns, 0):
         degrees, given = float(np.degrees(angle)), case.configuration.pose.heading_deg or 0.0
         turned = {
             "value": angle,
@@ -266,7 +269,15 @@ def ask_mounting(case: Case) -> Case:
             "pose": str(pose),
         }
         case.findings.append(Finding("pose_angle", "info", "pose", turned))
-    if abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and known[0].form != "steering":
+    is_told = abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and _is_apart(columns, 1)
+    if is_told and known[0].form != "steering":
         apart = {"value": lever, "half_m": 1.96 * abs(lever / of_lever), "pose": str(pose)}
         case.findings.append(Finding("pose_lever", "info", "pose", apart))
     return case
+
+
+def _is_apart(columns: Floats, index: int) -> bool:
+    """Whether one of several columns, shape (n, k), is more than a sum of the others."""
+    column, others = columns[:, index], np.delete(columns, index, axis=1)
+    gains = np.linalg.lstsq(others, column, rcond=None)[0]
+    return measure_share(column, others @ gains) < _TOGETHER

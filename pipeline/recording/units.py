@@ -82,8 +82,9 @@ def resolve_steering(case: Case, drive: Candidate) -> Candidate:
     for unit, one in tried.items():
         made = one.explained
         nats[unit] = float((made.turned.blocks - made.none[1]).sum())
-        turns = made.sign("turned") and made.sign("ahead")
-        lengths[unit] = abs(float(made.ahead.gains[0] / made.turned.gains[0])) if turns else None
+        # A speed that is the same throughout is taken as it is commanded.
+        gain = made.ahead.gains[0] if made.sign("ahead") else 1.0
+        lengths[unit] = abs(float(gain / made.turned.gains[0])) if made.sign("turned") else None
     known = case.vehicle.wheelbase_m if case.is_known else None
     steering = find_steering_unit(nats, lengths, known, str(drive.source))
     return replace(drive, steering=steering, reading=tried[steering.likeliest[1]])

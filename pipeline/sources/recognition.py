@@ -19,8 +19,8 @@ from pipeline.sources.configuration import Vehicle, list_presets, make_id
 #
 # A wheel is a continuous joint that turns about the body's lateral axis; a steering joint turns about its
 # vertical one and carries a wheel, or its name indicates steering. Casters are excluded. Wheels are mecanum
-# wheels if the text mentions mecanum or rollers. The radius is that of the wheel's cylinder, else the height
-# of its axis over base_footprint.
+# wheels if the text mentions mecanum or rollers. What turns alike above them, as an arm does, is none. The
+# radius is that of the wheel's cylinder, else the height of its axis over base_footprint.
 
 _LONGEST = 8_000_000
 _LATERAL = 0.9
@@ -28,6 +28,8 @@ _CASTER = re.compile(r"caster|castor|swivel|rocker|suspension")
 _ROLLERS = re.compile(r"mecanum|roller")
 _ROLLS = ("continuous", "revolute")
 _APART_M = 0.02
+_HIGHER = 1.5
+"""Height of an axis over the lowest one up to which it is a wheel's, in radii of that one."""
 
 
 @dataclass(frozen=True)
@@ -86,22 +88,36 @@ def read_description(text: str) -> Description | None:
             wheels.append((joint, position))
         elif abs(axis[2]) > _LATERAL and "steer" in joint.name.lower():
             steering.append((joint, position))
+    links = {link.get("name", ""): link for link in robot.iter("link")}
+    wheels = _take_standing(wheels, links)
     if not any(position[1] > 0.0 for _, position in wheels) or not any(
         position[1] < 0.0 for _, position in wheels
     ):
         return None
-    described = _make_vehicle(robot, wheels, steering, joints)
+    described = _make_vehicle(robot.get("name", ""), links, wheels, steering, joints)
     has_rollers = described.kind == "differential" and bool(_ROLLERS.search(text.lower()))
     return replace(described, kind="mecanum") if has_rollers else described
 
 
+def _take_standing(
+    wheels: list[tuple[_Joint, Floats]], links: Mapping[str, ET.Element]
+) -> list[tuple[_Joint, Floats]]:
+    """The joints that are as low as wheels on one ground are, and not those of an arm above them."""
+    if not wheels:
+        return []
+    lowest, position = min(wheels, key=lambda one: float(one[1][2]))
+    # Wheels of both sides do not meet.
+    radius = _read_radius(links.get(lowest.child)) or abs(float(position[1]))
+    return [one for one in wheels if float(one[1][2] - position[2]) < _HIGHER * radius]
+
+
 def _make_vehicle(
-    robot: ET.Element,
+    name: str,
+    links: Mapping[str, ET.Element],
     wheels: list[tuple[_Joint, Floats]],
     steering: list[tuple[_Joint, Floats]],
     joints: Mapping[str, _Joint],
 ) -> Description:
-    links = {link.get("name", ""): link for link in robot.iter("link")}
     radii = [radius for joint, _ in wheels if (radius := _read_radius(links.get(joint.child)))]
     if not radii:
         footprint = [_locate_in("base_footprint", joint, joints) for joint, _ in wheels]
@@ -114,7 +130,7 @@ def _make_vehicle(
     rear = min(position[0] for position in driven)
     front = float(np.mean(ahead)) if ahead else max(position[0] for position in driven)
     return Description(
-        name=robot.get("name", ""),
+        name=name,
         kind="ackermann" if steering else "differential",
         wheel_radius_m=float(np.median(radii)) if radii else None,
         track_width_m=float(np.mean(left) - np.mean(right)) if left and right else None,

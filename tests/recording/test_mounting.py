@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_drives import DrawnTopic, draw_drive, record_cdr, record_twist, stamp_ros, write_drawn
-from drawn_motion import draw
+from drawn_motion import STEP, draw
 from written_logs import write_log
 
 from pipeline.analysis import Options
@@ -48,6 +48,18 @@ def test_a_sensor_ahead_of_the_axle(ahead_m: float, tmp_path: Path) -> None:
     lever, text = find(write_log(tmp_path / "log.mcap", mounted))["pose_lever"]
     assert lever == pytest.approx(ahead_m, abs=0.02)
     assert ("behind" if ahead_m > 0.0 else "ahead of") in text
+
+
+def test_at_one_speed_nothing_tells_a_sensor_ahead_from_a_slide(tmp_path: Path) -> None:
+    drive = draw(63)
+    rng = np.random.default_rng(5)
+    turn = np.full(drive.time.size, 0.2)
+    yaw = (np.cumsum(turn) * STEP)[drive.rows] + rng.normal(0.0, 0.003, drive.rows.size)
+    # An odometry that adds up its speeds: it never moves sideways.
+    place = np.cumsum(1.5 * 10.0 * STEP * np.exp(1j * np.append(yaw[0], yaw[:-1])))
+    circle = replace(drive, place=place, yaw=yaw, speed=1.5 + 0.0 * turn, rate=turn)
+    asked = np.tile([1.5, 0.3], (turn.size, 1))
+    assert "pose_lever" not in find(write_log(tmp_path / "log.mcap", circle, asked=asked, is_measured=False))
 
 
 def tumble(axis: str, kind: str, seed: int) -> list[DrawnTopic]:

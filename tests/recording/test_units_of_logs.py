@@ -32,14 +32,25 @@ def test_a_speed_in_kilometres_per_hour(tmp_path: Path) -> None:
 
 
 def write_car(
-    path: Path, speed: float, angle: float, wheelbase: float = 0.9, measured: float | None = None
+    path: Path,
+    speed: float,
+    angle: float,
+    wheelbase: float = 0.9,
+    measured: float | None = None,
+    widest: float = np.inf,
 ) -> Path:
-    """A car that takes its commands in other units, and may measure its speed, in another one, too."""
+    """A car that takes its commands in other units, and may measure its speed, in another one, too.
+
+    Of a car that steers no farther than `widest` more is asked than that, at one speed.
+    """
     drive = draw(42)
     asked = np.column_stack([drive.asked[:, 0], 0.35 * drive.asked[:, 1]])
+    if widest < np.inf:
+        asked = np.column_stack([np.full(drive.time.size, 0.8), 1.1 * drive.asked[:, 1]])
     made = np.zeros_like(asked)
     for k in range(1, made.shape[0]):
         made[k] = made[k - 1] + STEP / 0.2 * (asked[k - 1] - made[k - 1])
+    made[:, 1] = np.clip(made[:, 1], -widest, widest)
     rate = made[:, 0] * np.tan(made[:, 1]) / wheelbase
     yaw = np.cumsum(rate) * STEP
     place = np.cumsum(made[:, 0] * np.exp(1j * yaw)) * STEP
@@ -74,6 +85,14 @@ def test_a_car_in_other_units(speed: float, angle: float, line: str, tmp_path: P
     if line:
         settled = [format_finding(one) for one in set_up(log, line).choice.findings]
         assert not [text for text in settled if line in text]
+
+
+def test_a_car_that_does_not_steer_as_far_as_it_is_asked_is_no_car_in_degrees(tmp_path: Path) -> None:
+    setup = set_up(write_car(tmp_path / "log.mcap", 1.0, 1.0, widest=0.35))
+    assert setup.configuration.command.steering_unit is None
+    wheelbase = setup.vehicle.wheelbase_m
+    assert wheelbase is not None
+    assert wheelbase > 0.5
 
 
 @pytest.mark.parametrize(

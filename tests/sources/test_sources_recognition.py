@@ -46,6 +46,18 @@ def test_wheels_of_a_description_give_radius_and_track(shape: str) -> None:
     assert found.wheels == ("wheel_left_joint", "wheel_right_joint")
 
 
+def test_joints_of_an_arm_on_a_base_are_no_wheels() -> None:
+    arm = """<joint name="arm_mount" type="fixed"><parent link="base_link"/><child link="arm"/>
+ <origin xyz="0.05 0 0.2" rpy="0 0 0"/></joint>
+<joint name="shoulder" type="revolute"><parent link="arm"/><child link="upper_arm"/>
+ <origin xyz="0.05 0.06 0.1" rpy="0 0 0"/><axis xyz="0 1 0"/></joint>
+<joint name="wrist" type="continuous"><parent link="upper_arm"/><child link="hand"/>
+ <origin xyz="0.3 -0.12 0" rpy="0 0 0"/><axis xyz="0 1 0"/></joint></robot>"""
+    for shape in (CYLINDER, MESH):
+        text = BURGER.format(shape=shape)
+        assert read_description(text.replace("</robot>", arm)) == read_description(text)
+
+
 def test_a_car_is_told_by_its_steering_joints() -> None:
     platform = PLATFORMS["ackermann_steering_controller"]
     (text,) = [one.fields["data"] for one in platform.topics if one.topic == "/robot_description"]
