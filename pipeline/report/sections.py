@@ -30,6 +30,7 @@ from pipeline.report import (
 from pipeline.report.figures import Figure, draw_figure
 from pipeline.report.figures.model_figures import BUDGET, ENOUGH, LADDER, SPLIT, VELOCITIES
 from pipeline.report.figures.residual_figures import REACH, RESIDUALS, SIGNATURE
+from pipeline.report.figures.signal_figures import SIGNALS, view_signals
 from pipeline.report.figures.slip_figures import COMMAND_SPACE, MODULUS, STEP_RESPONSE, TRAJECTORY
 from pipeline.report.figures.stretch_figures import MOTION, PATHS
 from pipeline.report.pages import Section
@@ -511,6 +512,7 @@ def sum_up_rest(report: RunReport) -> str:
 
 _FIGURES: Mapping[str, tuple[Figure, ...]] = {
     "glance": (PATHS, MOTION),
+    "signals": (SIGNALS,),
     "why": (LADDER, SIGNATURE),
     "where": (TRAJECTORY, COMMAND_SPACE, REACH),
     "how-bad": (MODULUS, VELOCITIES),
@@ -543,6 +545,9 @@ def list_sections(scene: Scene) -> list[Section]:
     where = show("where", "Where", view_where(report), sum_up_where(report))
     return [
         glance,
+        show(
+            "signals", "Signals", view_signals(scene), "any two columns of the tables of this run over time"
+        ),
         show("why", "Effects", view_why(report)),
         show("what-now", "What to do next", view_what_now(report)),
         # Without a model to look at, the map is what there is to see.

@@ -135,7 +135,7 @@ def test_text_out_of_a_log_stays_text() -> None:
     for key in ["run", "vehicle", "terrain", "dataset", "topic", "reason", "finding", "where"]:
         page = render_report(make_report(duration_s=20.0, names={key: HOSTILE}))
         outline = outline_of(page)
-        assert len(outline.scripts) == 3
+        assert len(outline.scripts) == 4
         assert not any(tag == "img" for tag, _ in outline.tags)
         assert outline.open == []
         assert "alert(1)</script>" not in page
