@@ -22,7 +22,6 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-import markdown
 from pictures import ROOT, SLIP, open_browser, serve_results
 from screen_states import LIFTED, SAMPLES, Screen, list_states
 
@@ -180,21 +179,10 @@ def write_plan(work: Path) -> Screen:
 
 
 def write_check(results: Path, work: Path) -> Screen:
-    """What `slip check` writes for a merge request, as such a site shows it."""
-    before, after = ROOT / "data_samples" / "husky_tile.mcap", work / "later.mcap"
+    """The page of `slip check`."""
+    before, after, page = ROOT / "data_samples" / "husky_tile.mcap", work / "later.mcap", work / "check.html"
     run_slip("simulate", "husky_tile", "--effect", "drive_lag=0.6", "--seed", 9, "--file", after)
-    run_slip("check", before, after, "--to", "markdown", "--file", work / "check.md", "--results", results)
-    text = markdown.markdown((work / "check.md").read_text(encoding="utf-8"), extensions=["tables"])
-    page = work / "check.html"
-    page.write_text(
-        '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>slip check</title>'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark"><style>body { font: 1rem/1.5 sans-serif; '
-        "margin: 1rem; overflow-wrap: break-word } table { display: block; overflow: auto } "
-        "td, th { padding: .2rem .5rem; text-align: left }</style>"
-        f"<body><main>{text}</main></body></html>",
-        encoding="utf-8",
-    )
+    run_slip("check", before, after, "--to", "html", "--file", page, "--results", results)
     return Screen("check", page.as_uri())
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from pipeline import plan as planning
 from pipeline.analysis import Options
 from pipeline.api.opening import Opener, Progress, open_quietly, show_nothing
-from pipeline.core import SlipError, align_rows, format_count, format_duration
+from pipeline.core import SlipError, format_count, format_duration
 from pipeline.estimation import Recording, diagnose_runs, load_recording
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.plan import SAFETY, CheckedPlan, Plan
@@ -62,7 +62,7 @@ class PlannedDrive:
         if not made.questions:
             return [f"no open question {runs}: no cause is undecided, and each number is known well enough"]
         ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-        rows = align_rows([(f"open {runs}".strip(), "so far", "with this drive"), *made.list_rows()])
+        rows = planning.tabulate_questions(made.list_rows(), f"open {runs}".strip()).align()
         most = f"limits       {made.limits.format(steered=made.steered)}"
         if not made.manoeuvres:
             nothing = f"no drive on {ground} of level ground answers an open question: no file is written"

@@ -500,6 +500,12 @@ class Check:
         """The text of `slip check --to junit`."""
         return format_junit(self._checked)
 
+    def to_html(self) -> str:
+        """The page of `slip check --to html`."""
+        from pipeline.report.datasets_page import render_check  # noqa: PLC0415 - only for this format
+
+        return render_check(self._checked)
+
     def __repr__(self) -> str:
         return "\n".join(words.format_lines(list_check_lines(self._checked)))
 

@@ -33,7 +33,7 @@ def check(  # noqa: D417 - the arguments document themselves
     vehicle_of: Annotated[
         Literal["model", "run"] | None, Parameter(help="geometry to use where vehicles differ")
     ] = None,
-    to: Annotated[Literal["markdown", "junit"] | None, Parameter(help="format of --file")] = None,
+    to: Annotated[Literal["markdown", "junit", "html"] | None, Parameter(help="format of --file")] = None,
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     effects: OwnEffects = None,
     results: Results = Path("results"),
@@ -53,7 +53,7 @@ def check(  # noqa: D417 - the arguments document themselves
         quiet: print no progress and no summary.
     """
     if to is None and file is not None:
-        what, hint = "--file says where, and not in which format", "Add --to markdown or --to junit."
+        what, hint = "--file says where, and not in which format", "Add --to markdown, junit or html."
         raise SlipError("wrong_options", what, hint=hint)
     if to is not None and file is None and json:
         what, hint = f"--json and --to {to} would both be printed", "Add --file FILE, or leave one out."
@@ -75,7 +75,8 @@ def check(  # noqa: D417 - the arguments document themselves
         opened=partial(open_shown, quiet=silent),
     )
     if to is not None:
-        text = checked.to_markdown() if to == "markdown" else checked.to_junit()
+        formats = {"markdown": checked.to_markdown, "junit": checked.to_junit, "html": checked.to_html}
+        text = formats[to]()
         if file is None:
             sys.stdout.write(text)
         else:

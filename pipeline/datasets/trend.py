@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, Floats, suffix_unit
+from pipeline.core import FEWEST_OF_SPREAD, Floats, format_count, suffix_unit
 from pipeline.datasets.compared_runs import find_material
 from pipeline.datasets.fleet import list_numbers
 from pipeline.datasets.levels import LEVEL, adjust
@@ -63,7 +63,7 @@ class Series:
     def describe(self) -> str:
         """The series in a sentence: its last value, and the step where there is one."""
         unit = suffix_unit(self.unit)
-        text = f"{self.points.height} runs, latest {self.points['value'][-1]:.3g}{unit}"
+        text = f"{format_count(self.points.height, 'run')}, latest {self.points['value'][-1]:.3g}{unit}"
         if self.step is None or not self.is_changed:
             few = ", too few for a test" if self.step is None else ", no significant step"
             return text + few

@@ -17,6 +17,7 @@ from pipeline.plan.plan import (
     SAFETY,
     Plan,
     make_plan,
+    tabulate_questions,
 )
 from pipeline.plan.plan_files import (
     FILES,

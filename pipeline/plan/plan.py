@@ -43,7 +43,7 @@ from pipeline.plan.manoeuvres import (
     wait,
 )
 from pipeline.plan.rehearsal import Rehearsal, Studied
-from pipeline.words import suggest_drive
+from pipeline.words import Column, Table, suggest_drive
 
 # Sizes of effects that may act unnoticed, as multiples of the usual ones, for the area of a drive.
 _SIZES = (0.7, 1.0, 1.5, 2.0)
@@ -68,6 +68,18 @@ SAFETY = (
 )
 Row = tuple[str, str, str]
 """A question, what the runs so far say of it, and what the drive adds."""
+
+
+def tabulate_questions(rows: Sequence[Row], about: str = "open", note: str = "") -> Table:
+    """Open questions as a table, as `Plan.list_rows` has them.
+
+    Args:
+        rows: the questions.
+        about: heading of the first column.
+        note: remark below the table.
+    """
+    columns = (Column(about), Column("so far"), Column("with this drive"))
+    return Table("Open questions", columns, rows, note)
 
 
 @dataclass(frozen=True)

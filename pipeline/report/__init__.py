@@ -17,12 +17,12 @@ import os
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import polars as pl
@@ -40,6 +40,7 @@ from pipeline.core import (
 )
 from pipeline.recording import Finding
 from pipeline.store import LOG_NOTES, LOG_STATES, Manifest, Store, date_runs
+from pipeline.words import NOTHING, Column
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -66,6 +67,8 @@ _LITERAL = re.compile(r"(`[^`]+`|(?<![\w-])--[a-z][a-z-]*)")
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
+_MINUS = re.compile(r"(?<![\w.)\]-])-(?=\.?\d)")
+"""Hyphen in front of a number."""
 _LABEL_LENGTH = 40
 """Characters of an axis' label that stand beside a figure without making it narrow."""
 
@@ -96,6 +99,11 @@ def _cut_middle(text: str, most: int) -> str:
 def set_squares(text: str) -> str:
     """Units of a text with squares as a page sets them: m/s\u00b2 for m/s^2."""
     return _SQUARE.sub("\\1\u00b2", text)
+
+
+def set_numbers(text: str) -> str:
+    """Numbers of a table's cell as a page sets them: with a minus, or a dash where unknown."""
+    return MISSING if text == NOTHING else _MINUS.sub("\u2212", text)
 
 
 def bracket_unit(unit: str) -> str:
@@ -211,6 +219,7 @@ def _environment() -> Environment:
         "split_literals": _LITERAL.split,
         "distance": format_distance,
         "number": format_number,
+        "numeral": set_numbers,
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
         "share": format_known_share,
     }
@@ -247,69 +256,6 @@ class Picture:
     title: str
     drawing: Drawing
     width: str = "full"
-
-
-@dataclass(frozen=True)
-class Column:
-    """Column of a table.
-
-    Attributes:
-        title: its heading.
-        unit: small text after the heading; `1` is none.
-        number: whether it is right-aligned.
-    """
-
-    title: str
-    unit: str = ""
-    number: bool = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "unit", suffix_unit(self.unit).strip())
-
-
-@dataclass(frozen=True)
-class Cell:
-    """Table cell with formatting.
-
-    Attributes:
-        text: main text.
-        sub: subscript after it, as in g_x; ``after`` follows.
-        before, small: small text before and after all that.
-        notes: small lines below it.
-        tag: bold or italics of the text.
-    """
-
-    text: str = ""
-    sub: str = ""
-    after: str = ""
-    small: str = ""
-    before: str = ""
-    notes: Sequence[str] = ()
-    tag: Literal["", "b", "i"] = ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """Table; the first column is the row header.
-
-    On a narrow screen a table of many columns becomes a list of rows, each cell beside its column's title.
-
-    Attributes:
-        caption: what it shows.
-        columns: the headings.
-        rows: rows with one cell per column.
-    """
-
-    caption: str
-    columns: Sequence[Column]
-    rows: Sequence[Sequence[str | Cell]] = field(default=())
-
-    def drop_empty(self) -> Table:
-        """The table without the columns in which no row has anything."""
-        nothing = ("", MISSING, Cell(MISSING))
-        some = [i for i in range(len(self.columns)) if any(row[i] not in nothing for row in self.rows)]
-        rows = [[row[i] for i in some] for row in self.rows]
-        return Table(self.caption, [self.columns[i] for i in some], rows)
 
 
 # Catalogue: one offline page over all runs, with sortable columns and a search box.

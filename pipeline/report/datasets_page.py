@@ -1,4 +1,4 @@
-"""The one page of what sets runs side by side: sentences, figures, tables, notes."""
+"""Pages of what sets runs side by side: comparison, causes, fleet, trend, map, check."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,84 +18,72 @@ from pipeline.datasets import (
     Causes,
     DeploymentMap,
     Fleet,
+    RunsCheck,
     Series,
     Trend,
 )
-from pipeline.report import (
-    Cell,
-    Column,
-    Picture,
-    Table,
-    bracket_unit,
-    format_number,
-    label_names,
-    theme,
-    write_page,
-)
-from pipeline.report.page import render_figures, write_pictures
+from pipeline.report import Picture, bracket_unit, format_number, label_names, theme, write_page
+from pipeline.report.page import write_pictures
+from pipeline.report.pages import Page, Section
 from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axis
 from pipeline.store import Store
-from pipeline.words import list_answer, list_shown_notes, name_series
+from pipeline.words import (
+    Table,
+    list_check_sentences,
+    list_compared,
+    list_series,
+    list_shown_notes,
+    name_series,
+    tabulate_answer,
+    tabulate_causes,
+    tabulate_check,
+    tabulate_datasets,
+    tabulate_fleet,
+    tabulate_limits,
+    tabulate_map,
+    tabulate_pairs,
+    tabulate_trend,
+)
 
 _ROW = 34
 _MOST_FIGURES = 40
 """Series of a page: those with a step come first."""
-_SHOWN = (
-    "dataset", "runs", "samples", "distance", "duration", "median_modulus", "low", "high", "interval",
-    "equal_modulus", "equal_low", "equal_high", "median_window_norm", "published_norm",
-)  # fmt: skip
-"""Columns of datasets on the page; the files beside it have all."""
-_PAIRS = (
-    "a", "b", "ratio", "ratio_low", "ratio_high", "shift", "low", "high", "cliffs_delta", "size",
-    "p_adjusted", "p", "spread", "freedom", "overlap", "method", "note",
-)  # fmt: skip
 
 
-def tabulate_frame(caption: str, frame: pl.DataFrame, units: Mapping[str, str] | None = None) -> Table:
-    """A table of Polars as one of a page, without the columns that are empty.
-
-    Args:
-        caption: what it shows.
-        frame: the table; ``_`` in names of columns becomes a space.
-        units: units of columns.
-    """
-    columns = [
-        Column(name.replace("_", " "), (units or {}).get(name, ""), number=kind.is_numeric())
-        for name, kind in frame.schema.items()
-    ]
-    rows: list[list[str | Cell]] = [
-        [
-            format_number(value) if isinstance(value, float) else "" if value is None else str(value)
-            for value in row
-        ]
-        for row in frame.iter_rows()
-    ]
-    return Table(caption, columns, rows).drop_empty()
-
-
-def _write(
-    store: Store,
-    name: str,
+def _build_page(
     title: str,
     facts: Sequence[str],
     *,
-    pictures: Sequence[Picture],
-    tables: Sequence[Table],
     lines: Sequence[str] = (),
+    pictures: Sequence[Picture] = (),
+    answer: Table | None = None,
+    tables: Sequence[Table] = (),
     notes: Sequence[str] = (),
     runs: Sequence[str] = (),
-    figures: FigureFormat | None = None,
-) -> dict[str, Path]:
+) -> Page:
+    """A result in sentences and figures, its numbers, and behind a line notes and the runs that count."""
+    counted = f"{format_count(len(notes), 'note')}, and the {format_count(len(runs), 'run')} counted"
+    return Page(
+        title,
+        facts,
+        [
+            Section(
+                "answer", "Result", lines=lines, pictures=pictures, tables=() if answer is None else [answer]
+            ),
+            Section("numbers", "Numbers", tables=tables),
+            Section("notes", "Notes", lines=notes, items=runs, brief=counted),
+        ],
+    )
+
+
+def _write(store: Store, name: str, page: Page, figures: FigureFormat | None = None) -> dict[str, Path]:
     """Write a page where figures can be drawn, and its figures if a format is given; the files by name."""
     written: dict[str, Path] = {}
-    if theme.can_draw() or not pictures:
-        page = render_figures(
-            "report/templates/datasets.html", pictures, title=title, facts=facts, lines=lines,
-            tables=[one for one in tables if one.rows], notes=notes, runs=runs,
-        )  # fmt: skip
-        written[name] = write_page(store, name, page)
+    if theme.can_draw() or not page.pictures:
+        written[name] = write_page(store, name, page.render())
     if figures is not None:
-        written |= {path.name: path for path in write_pictures(pictures, store.root / "figures", figures)}
+        made = write_pictures(page.pictures, store.root / "figures", figures)
+        written |= {path.name: path for path in made}
     return written
 
 
@@ -120,28 +108,19 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
     store.write_results_table("features", answer.features)
     main = answer.datasets.filter(pl.col("input").cast(pl.String) == answer.input)
     published = answer.views[0][1] == AS_PUBLISHED
-    tables = [
-        tabulate_frame(f"Datasets, slip {INPUT_WORDS[answer.input]}; medians over runs", main.select(_SHOWN))
-    ]
-    for source, quantity in answer.views:
-        pairs = answer.take(answer.comparisons, (source, quantity)).sort(
-            "p_adjusted", "a", "b", nulls_last=True
-        )
-        tables.append(
-            tabulate_frame(f"Pairs {QUANTITIES[quantity]}, {INPUT_WORDS[source]}", pairs.select(_PAIRS))
-        )
-    return written | _write(
-        store,
-        "comparison.html",
+    page = _build_page(
         "Deployments compared",
         [format_count(main.height, "dataset"), f"{main['runs'].sum()} runs", answer.measure],
-        lines=[f"{title}, {about}: {text}" for title, about, text in list_answer(answer)],
+        answer=tabulate_answer(answer),
         pictures=[picture for view in answer.views if (picture := _draw_levels(answer, view))],
-        tables=tables,
+        tables=[
+            *(tabulate_datasets(answer, source) for source in dict.fromkeys(one for one, _ in answer.views)),
+            *(tabulate_pairs(answer, view) for view in answer.views),
+        ],
         notes=[*list_shown_notes(answer), *([ABOUT_UNIT] if published else [])],
         runs=[key for keys in main["keys"] for key in keys.split()],
-        figures=figures,
     )
+    return written | _write(store, "comparison.html", page, figures)
 
 
 def _draw_levels(answer: Answer, view: tuple[str, str]) -> Picture | None:
@@ -214,22 +193,16 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         name: store.write_results_text(name, format_csv(frame, digits=6))
         for name, frame in (("causes.csv", budgets), ("cause_differences.csv", differences))
     }
-    caption = "Differences of RMS slip by cause; p over the causes of a pair"
-    return written | _write(
-        store,
-        "causes.html",
+    page = _build_page(
         "Deployments compared by cause",
         [format_count(len(causes.budgets), "dataset"), f"slip {INPUT_WORDS[causes.input]}"],
         lines=[one.describe(causes.names) for one in causes.differences],
         pictures=[_draw_causes(causes.budgets, causes.names)],
-        tables=[
-            tabulate_frame("Budgets: shares of the mean square slip, means over runs", budgets),
-            tabulate_frame(caption, differences, {"difference": "m/s"}),
-        ],
+        tables=tabulate_causes(causes),
         notes=causes.notes,
         runs=causes.keys,
-        figures=figures,
     )
+    return written | _write(store, "causes.html", page, figures)
 
 
 def _draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
@@ -265,53 +238,35 @@ def _draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture
 
 def write_fleet(store: Store, fleet: Fleet) -> dict[str, Path]:
     """Write the table `fleet` and `fleet.html`; the files by name."""
-    table = fleet.tabulate()
-    store.write_results_table("fleet", table)
-    columns = (
-        "effect", "parameter", "terrain", "level", "value", "low", "high", "another_low", "another_high",
-        "unit",
-        "spread_terrain", "spread_run", "runs", "named", "name", "because",
-    )  # fmt: skip
-    tables = [
-        tabulate_frame(f"{vehicle}: levels, and what to expect of another run", rows.select(columns))
-        for (vehicle,), rows in table.partition_by("vehicle", as_dict=True, maintain_order=True).items()
-    ]
-    facts = [format_count(len(fleet.runs), "vehicle"), format_count(len(fleet.keys), "run")]
-    lines = [fleet.summary.rstrip(".")]
-    title = "Parameters by level: vehicle, terrain, run"
-    return {"fleet.parquet": store.root / "fleet.parquet"} | _write(
-        store,
-        "fleet.html",
-        title,
-        facts,
-        lines=lines,
-        pictures=[],
-        tables=tables,
+    store.write_results_table("fleet", fleet.tabulate())
+    page = _build_page(
+        "Parameters by level: vehicle, terrain, run",
+        [format_count(len(fleet.runs), "vehicle"), format_count(len(fleet.keys), "run")],
+        lines=[fleet.summary.rstrip(".")],
+        tables=tabulate_fleet(fleet),
         notes=fleet.notes,
         runs=fleet.keys,
     )
+    return {"fleet.parquet": store.root / "fleet.parquet"} | _write(store, "fleet.html", page)
 
 
 def write_trend(store: Store, trend: Trend) -> dict[str, Path]:
-    """Write `trend.html`; the files by name. Window norms, which say what medians say, stay in the JSON."""
-    named = [(name_series(one), one) for one in trend.series if not one.quantity.startswith("median_window")]
-    shown = [(name, one) for name, one in named if one.points.height > 1][:_MOST_FIGURES]
-    rows = [(one.group, name, one.points.height, one.describe()) for name, one in named]
-    table = pl.DataFrame(rows, schema=["group", "quantity", "runs", "result"], orient="row")
-    return _write(
-        store,
-        "trend.html",
+    """Write `trend.html`; the files by name."""
+    series = list_series(trend)
+    drawn = [one for one in series if one.points.height > 1][:_MOST_FIGURES]
+    page = _build_page(
         "Trends",
-        [f"{len(named)} series", format_count(len(trend.keys), "run")],
-        lines=[f"{name} of {one.group}: {one.describe()}" for name, one in named if one.is_changed],
-        pictures=[_draw_series(one, name, f"trend_{number}") for number, (name, one) in enumerate(shown)],
-        tables=[tabulate_frame("All series", table)],
+        [f"{len(series)} series", format_count(len(trend.keys), "run")],
+        lines=[f"{name_series(one)} of {one.group}: {one.describe()}" for one in series if one.is_changed],
+        pictures=[_draw_series(one, f"trend_{number}") for number, one in enumerate(drawn)],
+        tables=[tabulate_trend(trend)],
         notes=trend.notes,
         runs=trend.keys,
     )
+    return _write(store, "trend.html", page)
 
 
-def _draw_series(series: Series, what: str, name: str) -> Picture:
+def _draw_series(series: Series, name: str) -> Picture:
     # In UTC on both sides: a browser elsewhere must not show the day before.
     dates = {"scale": {"type": "utc"}, "axis": {"title": "date", "format": "%Y-%m-%d", "tickCount": 5}}
     rows = series.points.with_columns(pl.col("day").str.to_date().cast(pl.Datetime("ms")).dt.epoch("ms"))
@@ -342,30 +297,23 @@ def _draw_series(series: Series, what: str, name: str) -> Picture:
         )
     chart = layer(*charts).properties(width=640, height=130, usermeta={"gutter": 60})
     text = series.describe()
-    title = f"{what} of {series.group}{bracket_unit(series.unit)}"
+    title = f"{name_series(series)} of {series.group}{bracket_unit(series.unit)}"
     return Picture(name, title, Drawing(chart, {name: rows}, text[:1].upper() + text[1:], text), width="half")
 
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> dict[str, Path]:
     """Write `map.html`, and its figure if a format is given; the files by name."""
     about = f"{drawn.measure.name} {INPUT_WORDS[drawn.input]}{bracket_unit(drawn.measure.unit)}"
-    units = {"energy": "J", drawn.measure.name.replace(" ", "_"): drawn.measure.unit}
-    named = drawn.own.rename({"value": drawn.measure.name.replace(" ", "_")})
     missing = f"not on the map, as mass, speed or terrain is not published: {', '.join(drawn.missing)}"
-    return _write(
-        store,
-        "map.html",
+    page = _build_page(
         "Deployment map",
         [f"{drawn.points.height} deployments", f"{drawn.own.height} own datasets"],
         pictures=[_draw_map(drawn, about)],
-        tables=[
-            tabulate_frame(f"Own datasets: largest kinetic energy of a run, {about}", named, units),
-            tabulate_frame("The literature", drawn.points, units),
-        ],
+        tables=tabulate_map(drawn),
         notes=[*drawn.notes, *([missing] if drawn.missing else [])],
         runs=drawn.keys,
-        figures=figures,
     )
+    return _write(store, "map.html", page, figures)
 
 
 def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
@@ -404,3 +352,21 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
     words = f"{drawn.points.height} deployments of the literature and {drawn.own.height} own datasets."
     rows = {"literature": drawn.points, "own": drawn.own}
     return Picture("deployment_map", "Energy and terrain", Drawing(chart, rows, note, words))
+
+
+def render_check(check: RunsCheck) -> str:
+    """The page of `slip check`."""
+    sides = check.sides
+    both = [
+        f"{format_count(len(runs), 'run')} {side}"
+        for side, runs in (("before", sides.before), ("after", sides.after))
+    ]
+    limits = tabulate_limits(check)
+    return _build_page(
+        "What changed between two drives",
+        both,
+        lines=list_check_sentences(check),
+        answer=limits if limits.rows else None,
+        tables=[tabulate_check(check)],
+        notes=[*sides.notes, *(f"{label} {text}" for label, text in list_compared(check))],
+    ).render()

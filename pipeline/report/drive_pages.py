@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import PathError, read_bounded_text, resolve_inside
-from pipeline.plan import FILES, SAFETY, Plan, write_plan
+from pipeline.plan import FILES, SAFETY, Plan, tabulate_questions, write_plan
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, set_squares, theme
-from pipeline.report.page import render_figures
+from pipeline.report.pages import Page, Section
 from pipeline.report.theme import (
     Chart,
     Drawing,
@@ -59,23 +59,37 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
         catalogue: relative address of the page over all runs; empty without one.
     """
     area = plan.area
-    return render_figures(
-        "report/templates/plan.html",
-        [_draw_ways(plan), _draw_commands(plan)],
-        title="What to drive next",
-        ways=list_ways(catalogue),
-        facts=[
+    half = "±: half-width of the 95 % interval, so far and as expected of the logs and this drive together."
+    has_intervals = any(one.kind == "interval" for one in plan.informative)
+    return Page(
+        "What to drive next",
+        [
             plan.vehicle,
             f"{plan.commands.duration_s:.0f} s",
             f"{area.length_m:g} x {area.width_m:g} m",
             f"at most {set_squares(plan.limits.format(steered=plan.steered))}",
         ],
-        safety=SAFETY,
-        play=f"ros2 bag play plan.mcap    # {plan.type_name} on {plan.topic}",
-        rows=plan.list_rows(),
-        has_intervals=any(one.kind == "interval" for one in plan.informative),
-        manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
-    )
+        [
+            Section(
+                "safety",
+                "Before you play it",
+                warnings=SAFETY,
+                lines=[f"Play it with `ros2 bag play plan.mcap`: {plan.type_name} on {plan.topic}"],
+            ),
+            Section(
+                "promises",
+                "What it tells",
+                tables=[tabulate_questions(plan.list_rows(), note=half if has_intervals else "")],
+            ),
+            Section(
+                "drive",
+                "The drive",
+                pictures=[_draw_ways(plan), _draw_commands(plan)],
+                items=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
+            ),
+        ],
+        ways=list_ways(catalogue),
+    ).render()
 
 
 def _draw_ways(plan: Plan) -> Picture:
@@ -148,6 +162,7 @@ def _draw_commands(plan: Plan) -> Picture:
 
 
 PREVIEW = "plan.json"
+_MOST_GAINS = 6
 
 
 def locate_plan(results: Path, run: str, name: str) -> Path:
@@ -184,7 +199,10 @@ def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
     except (StoreError, PathError):
         return {}
     address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
-    return {**msgspec.structs.asdict(preview), "address": address} if preview.key == key else {}
+    # Of a drive the first questions are what it is for; of none, all are open.
+    table = tabulate_questions(preview.gains[:_MOST_GAINS] if preview.drives else preview.gains)
+    shown = {**msgspec.structs.asdict(preview), "address": address, "table": table}
+    return shown if preview.key == key else {}
 
 
 def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:

@@ -41,6 +41,31 @@
   document.addEventListener("toggle", ({ target }) => (queue = queue.then(() => drawAll(undefined, target))), true);
   document.addEventListener("keydown", (event) => event.key === "Escape" && marks.leave());
 
+  // Signals of the reader's choice -----------------------------------------------------------------------------
+
+  const packed = JSON.parse(find("signals-data")?.textContent ?? "{}");
+  const unpackNumbers = (text, Kind) => new Kind(Uint8Array.from(atob(text), (mark) => mark.charCodeAt(0)).buffer);
+  const readSignal = (table, name) => {
+    const { t: times, hole, columns } = packed[table];
+    const { low, step, values } = columns[name];
+    const rows = { t: [], value: [] };
+    const numbers = unpackNumbers(values, Int16Array);
+    unpackNumbers(times, Int32Array).forEach((ms, at, all) => {
+      const breaks = at > 0 && ms - all[at - 1] > 1000 * hole;
+      rows.t.push(...(breaks ? [ms / 1000] : []), ms / 1000);
+      rows.value.push(...(breaks ? [null] : []), numbers[at] < 0 ? null : low + step * numbers[at]);
+    });
+    return rows;
+  };
+  for (const choice of document.querySelectorAll(".signal")) {
+    choice.addEventListener("change", () => {
+      const [{ value, dataset }] = choice.selectedOptions;
+      const names = [...document.querySelectorAll(".signal")].map((one) => `${one.value} of ${one.selectedOptions[0].dataset.table}`);
+      document.querySelector("[data-figure=signals]").setAttribute("aria-label", `Over time: ${names.join(" and ")}.`);
+      plots.feed({ [choice.dataset.rows]: readSignal(dataset.table, value) });
+    });
+  }
+
   // A way into a folded chapter opens it.
   const unfold = (id) => {
     const fold = id && find(id)?.closest("details");

@@ -1,13 +1,8 @@
-"""Page of a run, and common parts of all pages with figures; figures as files.
-
-A page is one file without network requests. Vega evaluates its expressions with its own interpreter, without
-`eval`.
-"""
+"""Page of a run; figures as files."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -18,14 +13,12 @@ from pipeline.report import (
     format_date,
     format_distance,
     list_ways,
-    read_own,
-    render_template,
-    theme,
 )
-from pipeline.report.figures import Figure, draw_figure
+from pipeline.report.figures import draw_figure
+from pipeline.report.pages import Page
 from pipeline.report.scene import RunReport, Scene
-from pipeline.report.sections import SECTIONS, list_figures, summarise_health
-from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
+from pipeline.report.sections import list_figures, list_sections, summarise_health
+from pipeline.report.theme import fill_spec
 
 
 def render_report(report: RunReport) -> str:
@@ -37,46 +30,18 @@ def render_report(report: RunReport) -> str:
     Returns:
         The page; the same report gives the same text.
     """
-    scene = Scene(report)
-    drawn = [_draw(section.figures, scene) for section in SECTIONS]
-    return render_figures(
-        "report/templates/run.html",
-        list(chain.from_iterable(drawn)),
-        title=report.text("run") or "run",
+    return Page(
+        report.text("run") or "run",
+        _list_facts(report),
+        list_sections(Scene(report)),
         ways=list_ways(report.catalogue),
-        facts=_list_facts(report),
         strip=summarise_health(report),
-        stretch=scene.stretch,
-        sections=[
-            (section, section.view(report), section.sum_up and section.sum_up(report), pictures)
-            for section, pictures in zip(SECTIONS, drawn, strict=True)
-        ],
-        # Without a model to look at, the map is what there is to see.
-        opened=() if drawn[0] else ("where",),
-    )
+    ).render()
 
 
-def _draw(figures: Iterable[Figure], scene: Scene) -> list[Picture]:
-    return [picture for figure in figures for picture in draw_figure(figure, scene)]
-
-
-def render_figures(template: str, pictures: Sequence[Picture], **values: object) -> str:
-    """Render a page of figures from a template that extends `figures.html`.
-
-    Args:
-        template: path of the template below `pipeline`.
-        pictures: the figures of the page.
-        values: other values: at least ``title`` and ``facts``.
-    """
-    own = ("plots.js", "marks.js", "cursor.js", "page.js")
-    scripts = [load_bundle(), "".join(read_own(f"report/{name}") for name in own)] if pictures else []
-    data = {
-        "figures": {picture.id: build_spec(picture.drawing) for picture in pictures},
-        "rows": share_rows(picture.drawing for picture in pictures),
-        "dark": dict(theme.DARK_TWINS),
-    }
-    style = read_own("report/page.css")
-    return render_template(template, style=style, scripts=scripts, data=data, pictures=pictures, **values)
+def _draw_all(report: RunReport) -> list[Picture]:
+    scene = Scene(report)
+    return [picture for figure in list_figures() for picture in draw_figure(figure, scene)]
 
 
 def _list_facts(report: RunReport) -> list[str]:
@@ -133,7 +98,7 @@ def show_figures(report: RunReport) -> dict[str, ShownFigure]:
     """Every figure for which the run has rows, by id."""
     return {
         picture.id: ShownFigure(picture.id, {**fill_spec(picture.drawing), "title": picture.title})
-        for picture in _draw(list_figures(), Scene(report))
+        for picture in _draw_all(report)
     }
 
 
@@ -143,7 +108,7 @@ def write_figures(
     format: Format,  # noqa: A002 - the word people use for it
 ) -> list[Path]:
     """Write every figure for which the run has rows, in the order of the page, as `write_pictures` does."""
-    return write_pictures(_draw(list_figures(), Scene(report)), folder, format)
+    return write_pictures(_draw_all(report), folder, format)
 
 
 def write_pictures(

@@ -8,11 +8,12 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.core import mapping_in, number_in, objects_in
+from pipeline.core import ROUNDING_S, mapping_in, number_in, objects_in
 from pipeline.report.motion_view import MotionView
 from pipeline.report.theme import round_up, usual_ends
 from pipeline.results import RunDiagnosis, find_refusal, read_findings
 from pipeline.run import HORIZON_S
+from pipeline.sources import VelocitySection
 from pipeline.words import format_finding
 
 INPUTS = ("command", "measured")
@@ -268,8 +269,23 @@ class Scene:
         return 1.0 / (self.report.number("rate_hz") or _DEFAULT_RATE_HZ)
 
     @cached_property
+    def one_sided_s(self) -> float:
+        """Distance from the end of a segment [s] below which velocities rest on poses of one side.
+
+        A fit to 4 poses of one side has several times the error of one in their middle. Two other fits were
+        tried: a window that stays whole, and curvatures that are pulled to zero by the noise; both are worse
+        where poses are known to a centimetre. So the tables have what was fitted, and figures leave it out.
+        """
+        configuration = mapping_in(self.report.part("provenance"), "configuration")
+        width = number_in(mapping_in(configuration, "velocity"), "window_s")
+        return 0.5 * (width or VelocitySection().window_s)
+
+    @cached_property
     def slip(self) -> dict[str, pl.DataFrame]:
-        """Slip by input, in order of time, with ``piece``: a number for each stretch without a gap."""
+        """Slip by input, in order of time, with ``piece``: a number for each stretch without a gap.
+
+        ``end`` says that a row is near the end of a segment, as `one_sided_s`.
+        """
         table = self.report.table("slip")
         if table is None:
             return {}
@@ -306,9 +322,15 @@ class Scene:
 
     @cached_property
     def velocities(self) -> pl.DataFrame | None:
-        """Velocities in order of time, with ``piece``."""
+        """Places in order of time, with ``piece``, and velocities, null where they are not to be drawn."""
         table = self.report.table("velocities")
-        return None if table is None else self._number_pieces(table)
+        if table is None:
+            return None
+        numbered = self._number_pieces(table)
+        # A wrong pose, often at the end of a segment, is no speed.
+        wrong = pl.col("end") | (pl.col("outlier") if "outlier" in table.columns else pl.lit(value=False))
+        shown = [pl.when(~wrong).then(f"v_{name}").alias(f"v_{name}") for name in COMPONENTS]
+        return numbered.with_columns(shown)
 
     @cached_property
     def time_domain(self) -> tuple[float, float] | None:
@@ -414,7 +436,7 @@ class Scene:
             columns = [pl.lit(None, pl.Float64).alias(name) for name in ("f_x", "f_w", "modulus")]
             joined = places.with_columns(columns)
         else:
-            sound = pl.when(~pl.col("suspect")).then("modulus").alias("modulus")
+            sound = pl.when(~pl.col("suspect") & ~pl.col("end")).then("modulus").alias("modulus")
             asked = self.main_slip.select("stamp", "segment", "f_x", "f_w", sound)
             asked = asked.unique(["stamp", "segment"], maintain_order=True)
             joined = places.join(asked, on=["stamp", "segment"], how="left", maintain_order="left")
@@ -429,16 +451,20 @@ class Scene:
 
         The series `model` is what the model leaves.
         """
-        residual = [] if self.main_residual is None else [(self.main_residual, "residual_modulus", "model")]
-        return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()] + residual)
+        lines = [(frame, "modulus", name) for name, frame in self.slip.items()]
+        if self.main_residual is not None:
+            lines.append((self.main_residual, "residual_modulus", "model"))
+        inside = pl.col("end").not_()
+        return self._join_lines(
+            [
+                (frame.with_columns(pl.when(inside).then(name).alias(name)), name, series)
+                for frame, name, series in lines
+            ]
+        )
 
     def component_lines(self, component: str) -> Thinned | None:
         """Velocities of `x`, `y` or `w` over time, long: ``t value series``, null where a line breaks."""
         measured = self.velocities if self.velocities is not None else self.main_slip
-        if measured is not None and "outlier" in measured.columns:
-            # A wrong pose, often at the end of a segment, is no speed.
-            known = pl.when(~pl.col("outlier")).then(pl.col(f"v_{component}"))
-            measured = measured.with_columns(known.alias(f"v_{component}"))
         lines = [] if measured is None else [(measured, f"v_{component}", "velocity")]
         return self._join_lines(
             [(frame, f"f_{component}", name) for name, frame in self.slip.items()] + lines
@@ -465,9 +491,14 @@ class Scene:
         ordered = frame.sort("segment", "t", maintain_order=True)
         hole = pl.col("t").diff() > _HOLE_PERIODS * self.period
         new = (hole | (pl.col("segment") != pl.col("segment").shift(1))).fill_null(value=False)
-        return ordered.with_columns(piece=new.cum_sum().cast(pl.Int32))
+        t = pl.col("t")
+        away = pl.min_horizontal(t - t.min().over("segment"), t.max().over("segment") - t)
+        return ordered.with_columns(
+            piece=new.cum_sum().cast(pl.Int32), end=away < self.one_sided_s - ROUNDING_S
+        )
 
     def _join_lines(self, lines: list[tuple[pl.DataFrame, str, str]]) -> Thinned | None:
+        lines = [one for one in lines if one[0][one[1]].count()]
         if not lines:
             return None
         parts, drawn, total, ends = [], 0, 0, list[float]()
@@ -477,5 +508,5 @@ class Scene:
             thinned = thin_series(line, "value", bins=LINE_BINS, whole=self.worst_span)
             parts.append(break_lines(thinned, "value").with_columns(series=pl.lit(series)))
             drawn, total = drawn + thinned.height, total + line.height
-            ends += usual_ends(frame[column], exact=column.startswith("f_"))
+            ends += usual_ends(frame[column].drop_nulls(), exact=column.startswith("f_"))
         return Thinned(pl.concat(parts), drawn, total, (min(ends), max(ends)))

@@ -1,11 +1,11 @@
-"""Sections of the page of a run: each is a heading, figures, a template, and the values that it shows."""
+"""Sections of the page of a run: each has its template, the values that it shows, and its figures."""
 
 import json
 import math
 import shlex
 import statistics
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
 from pipeline.core import (
     INPUT_WORDS,
@@ -20,9 +20,6 @@ from pipeline.models import list_effects, name_term, suggest_manoeuvre
 from pipeline.recording import Finding
 from pipeline.report import (
     MISSING,
-    Cell,
-    Column,
-    Table,
     begin_large,
     count_serious,
     format_known_share,
@@ -30,12 +27,14 @@ from pipeline.report import (
     format_split,
     set_squares,
 )
-from pipeline.report.figures import Figure
+from pipeline.report.figures import Figure, draw_figure
 from pipeline.report.figures.model_figures import BUDGET, ENOUGH, LADDER, SPLIT, VELOCITIES
 from pipeline.report.figures.residual_figures import REACH, RESIDUALS, SIGNATURE
+from pipeline.report.figures.signal_figures import SIGNALS, view_signals
 from pipeline.report.figures.slip_figures import COMMAND_SPACE, MODULUS, STEP_RESPONSE, TRAJECTORY
 from pipeline.report.figures.stretch_figures import MOTION, PATHS
-from pipeline.report.scene import RunReport
+from pipeline.report.pages import Section
+from pipeline.report.scene import RunReport, Scene
 from pipeline.results import (
     Named,
     has_no_pose,
@@ -46,6 +45,9 @@ from pipeline.results import (
     split_main,
 )
 from pipeline.words import (
+    Cell,
+    Column,
+    Table,
     describe_cause,
     describe_motion,
     describe_regions,
@@ -482,26 +484,6 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "residual", describe_rest(diagnosis), ""
 
 
-@dataclass(frozen=True)
-class Section:
-    """One section of the page; it is left out where its template has nothing to show.
-
-    Attributes:
-        id: anchor, and the name of its template in `templates/sections`.
-        title: heading.
-        view: function that returns the values for the template.
-        figures: what is drawn in it, in order; those without rows are left out.
-        sum_up: function that returns the line beside the heading of a folded section; None for one that is
-            always open.
-    """
-
-    id: str
-    title: str
-    view: Callable[[RunReport], Mapping[str, object]] = lambda _: {}
-    figures: tuple[Figure, ...] = ()
-    sum_up: Callable[[RunReport], str] | None = None
-
-
 def sum_up_where(report: RunReport) -> str:
     """The region that carries most of the ideal model's error."""
     if not report.diagnosis.ladder:
@@ -527,35 +509,50 @@ def sum_up_rest(report: RunReport) -> str:
     return format_remaining(report) or (ideal if report.diagnosis.ladder else "")
 
 
-SECTIONS = (
-    Section("glance", "At a glance", view_glance, (PATHS, MOTION)),
-    Section("why", "Effects", view_why, (LADDER, SIGNATURE)),
-    Section("what-now", "What to do next", view_what_now),
-    Section("where", "Where", view_where, (TRAJECTORY, COMMAND_SPACE, REACH), sum_up_where),
-    Section("how-bad", "How much slip", view_how_bad, (MODULUS, VELOCITIES), sum_up_slip),
-    Section(
-        "rest",
-        "Remaining error",
-        figures=(BUDGET, RESIDUALS, STEP_RESPONSE, SPLIT, ENOUGH),
-        sum_up=sum_up_rest,
-    ),
-    Section(
-        "health",
-        "Data health",
-        view_health,
-        sum_up=lambda report: ", ".join(words for _, words in summarise_health(report)),
-    ),
-    Section(
-        "provenance",
-        "Provenance",
-        view_provenance,
-        sum_up=lambda report: str(report.part("log").get("path") or ""),
-    ),
-)
-"""Sections of the page in order: the verdict with the first picture, the effects, what to do next; others are
-folded behind a line that says what they hold."""
+_FIGURES: Mapping[str, tuple[Figure, ...]] = {
+    "glance": (PATHS, MOTION),
+    "signals": (SIGNALS,),
+    "why": (LADDER, SIGNATURE),
+    "where": (TRAJECTORY, COMMAND_SPACE, REACH),
+    "how-bad": (MODULUS, VELOCITIES),
+    "rest": (BUDGET, RESIDUALS, STEP_RESPONSE, SPLIT, ENOUGH),
+}
+"""What is drawn in each section, in order; figures without rows are left out."""
 
 
 def list_figures() -> list[Figure]:
     """All figures, in the order of the page."""
-    return [figure for section in SECTIONS for figure in section.figures]
+    return [figure for figures in _FIGURES.values() for figure in figures]
+
+
+def list_sections(scene: Scene) -> list[Section]:
+    """Sections of the page: verdict and first picture, effects, what to do next; others folded.
+
+    Args:
+        scene: the run.
+    """
+    report = scene.report
+
+    def show(name: str, title: str, view: Mapping[str, object], brief: str | None = None) -> Section:
+        pictures = [picture for figure in _FIGURES.get(name, ()) for picture in draw_figure(figure, scene)]
+        return Section(
+            name, title, pictures=pictures, brief=brief, template=name if view else "plain", view=view
+        )
+
+    glance = show("glance", "At a glance", {**view_glance(report), "stretch": scene.stretch})
+    health = ", ".join(words for _, words in summarise_health(report))
+    where = show("where", "Where", view_where(report), sum_up_where(report))
+    return [
+        glance,
+        show(
+            "signals", "Signals", view_signals(scene), "any two columns of the tables of this run over time"
+        ),
+        show("why", "Effects", view_why(report)),
+        show("what-now", "What to do next", view_what_now(report)),
+        # Without a model to look at, the map is what there is to see.
+        replace(where, is_open=not glance.pictures),
+        show("how-bad", "How much slip", view_how_bad(report), sum_up_slip(report)),
+        show("rest", "Remaining error", {}, sum_up_rest(report)),
+        show("health", "Data health", view_health(report), health),
+        show("provenance", "Provenance", view_provenance(report), str(report.part("log").get("path") or "")),
+    ]

@@ -373,7 +373,7 @@ def warm_bundle() -> None:
 def _bundle_apart() -> None:
     with contextlib.suppress(OSError):
         subprocess.run(  # noqa: S603 - our own words
-            python_command("-c", "from pipeline.report.page import load_bundle; load_bundle()"),
+            python_command("-c", "from pipeline.report.theme import load_bundle; load_bundle()"),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -58,6 +58,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         channel, formula, parameters: fields of a formula, as typed.
         tab: tab of the figures; empty for all.
         stretch: index of the enlarged stretch, 0 for the one with the largest error.
+        on: name of another run, to validate the model on.
     """
 
     run: str
@@ -76,6 +77,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     parameters: Line = ""
     tab: Literal["", "first", "where", "effects", "residual", "budget"] = ""
     stretch: int = 0
+    on: str = ""
 
 
 @contextmanager

@@ -137,6 +137,7 @@ export class Pane {
     this.signatures = [];
     this.loaded = new Set();
     this.stretch = 0;
+    this.validated = undefined;
     this.cursor.stop();
     for (const part of [this.glance, this.model, this.first, this.reach, ...Object.values(this.tabs.grids)]) part.replaceChildren();
     this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "preparing the run …"), working());
@@ -155,6 +156,7 @@ export class Pane {
     }
     this.glance.querySelector(".said").textContent = session.undo === null ? "" : session.said;
     buildModel(this);
+    this.validate();
     this.shown?.();
     return run;
   }
@@ -193,7 +195,51 @@ export class Pane {
           h("p", { class: "ends" }, h("span", { class: "floor-said" }), h("span", { class: "ideal-said" }))),
         h("div", { class: "steps" }, tool("undo", "Undo", () => this.act("undo")), tool("redo", "Redo", () => this.act("redo")))),
       h("p", { class: "end", role: "status" }),
-      h("p", { class: "said", role: "status" }));
+      h("p", { class: "said", role: "status" }),
+      h("div", { class: "validation" },
+        h("label", {}, "Errors on another run, with the numbers of this one: ",
+          h("select", { class: "validate", onchange: () => this.validate() }, h("option", { value: "" }, "choose a run …"))),
+        h("p", { class: "validated", role: "status" })));
+    this.fillValidation();
+  }
+
+  // Runs of the same vehicle, those of other grounds after those of the same.
+  fillValidation() {
+    const choice = this.glance.querySelector(".validate");
+    if (!choice || !this.runs || !this.state) return;
+    const { run } = this.state;
+    const others = this.runs.filter((one) => one.run !== this.run && one.vehicle === run.vehicle && !one.refusal);
+    others.sort((one, other) => (other.terrain === run.terrain) - (one.terrain === run.terrain) || one.run.localeCompare(other.run));
+    const kept = choice.value;
+    choice.replaceChildren(choice.firstElementChild, ...others.map((one) => h("option", { value: one.run }, [one.run, one.terrain].filter(Boolean).join(" · "))));
+    choice.value = others.some((one) => one.run === kept) ? kept : "";
+    choice.closest(".validation").hidden = !others.length;
+  }
+
+  // Anew whenever the model is another one; what was asked for a model before it is not shown.
+  async validate() {
+    const on = this.glance.querySelector(".validate")?.value ?? "";
+    const { session } = this.state;
+    const key = on && JSON.stringify([on, session.run, session.input, session.effects.map(({ id, parameters }) => [id, parameters.map(({ value }) => value)])]);
+    if (key === this.validated) return;
+    this.validated = key;
+    const said = this.glance.querySelector(".validated");
+    said.textContent = on && `predicting ${on} …`;
+    if (!on) return;
+    try {
+      const answer = await post("/api/validate", { run: session.run, slot: this.slot, input: session.input, on });
+      if (this.validated === key) said.textContent = this.sayValidation(answer);
+    } catch (error) {
+      if (this.validated === key) said.textContent = error.message;
+    }
+  }
+
+  sayValidation({ on, ideal, carried, own, warning }) {
+    const isIdeal = !this.state.session.effects.length;
+    const parts = [["position", "t", sayLength], ["heading", "r", sayAngle]].map(([name, key, words]) =>
+      `${name} ${words(carried[key])}${isIdeal ? "" : ` (ideal model ${words(ideal[key])}, fitted there ${words(own[key])})`}`);
+    if (isIdeal) return `${on}: ${parts.join(", ")} with the ideal model.`;
+    return `${on}: ${parts.join(", ")}. ${warning ? `${warning[0].toUpperCase()}${warning.slice(1)}` : "The model holds there"}.`;
   }
 
   // The run beside the others of its dataset.
@@ -456,6 +502,7 @@ export class Pane {
 
   fillLists() {
     this.showRuns();
+    this.fillValidation();
     this.tabs.panels.compare.replaceChildren(...(this.buildRivals?.() ?? []));
   }
 

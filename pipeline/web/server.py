@@ -63,6 +63,7 @@ class Web:
             "figures": bench.draw,
             "rows": bench.redraw,
             "save": bench.save,
+            "validate": bench.validate,
             "diagnose": bench.diagnose,
         }
         own = [file for room in _ROOMS for file in room.iterdir() if file.suffix in (".js", ".css")]

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from pipeline.api.model_changes import carry_models
 from pipeline.core import Newest, SlipError
 from pipeline.estimation import EstimationData
 from pipeline.estimation.additions import Addition, Tries
@@ -132,6 +133,24 @@ class Workbench:
         make_folder(path.parent)
         write_model(file, path)
         return {"path": str(path)}
+
+    def validate(self, ask: Ask) -> dict[str, object]:
+        """Errors of a session's model on another run, whose numbers are not fitted to it.
+
+        They are those of `slip model compare`; other requests need not wait for them.
+        """
+        file, there = self._make_file(ask), find_run(self.store, ask.on)
+        if refusal := summarize_run(there)["refusal"]:
+            hint = "No error on it has a meaning: choose another run."
+            raise WorkbenchError("no_fit", str(refusal), where=ask.on, hint=hint)
+        with evaluating(ask.on):
+            ((_, item),) = carry_models({ask.run: file}, [there], source=ask.input).rows
+        errors = {"ideal": item.ideal, "carried": item.carried, "own": item.own}
+        return {
+            "on": ask.on,
+            **{name: _errors(one.pooled) for name, one in errors.items()},
+            "warning": item.warning,
+        }
 
     def format_model(self, ask: Ask) -> str:
         """The model file of a session as text."""

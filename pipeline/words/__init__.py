@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.words.fleet import *
     from pipeline.words.models import *
     from pipeline.words.objects import *
+    from pipeline.words.tables import *
     from pipeline.words.verdict import *
 else:
     __getattr__ = open_door(
@@ -29,6 +30,10 @@ else:
                 "format_junit",
                 "format_markdown",
                 "list_check_lines",
+                "list_check_sentences",
+                "list_compared",
+                "tabulate_check",
+                "tabulate_limits",
             ),
             "comparison": (
                 "format_answer",
@@ -36,6 +41,10 @@ else:
                 "list_answer",
                 "list_shown_notes",
                 "summarize_answer",
+                "tabulate_answer",
+                "tabulate_causes",
+                "tabulate_datasets",
+                "tabulate_pairs",
             ),
             "diagnosis": (
                 "VERDICT",
@@ -70,8 +79,12 @@ else:
                 "format_fleet",
                 "format_map",
                 "format_trend",
+                "list_series",
                 "name_series",
                 "summarize_map",
+                "tabulate_fleet",
+                "tabulate_map",
+                "tabulate_trend",
             ),
             "models": (
                 "format_change",
@@ -85,6 +98,7 @@ else:
                 "suggest_export",
             ),
             "objects": ("diagnosis_as_json",),
+            "tables": ("NOTHING", "Cell", "Column", "Table"),
             "verdict": (
                 "format_refusal",
                 "format_verdict",

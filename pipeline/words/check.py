@@ -5,7 +5,6 @@ import re
 from xml.etree import ElementTree as ET
 
 from pipeline.core import (
-    align_rows,
     enumerate_texts,
     format_angle,
     format_count,
@@ -15,11 +14,18 @@ from pipeline.core import (
     suffix_unit,
 )
 from pipeline.datasets import CheckedNumber, RunsCheck
+from pipeline.words.tables import Cell, Column, Table
 
 Line = tuple[str, str]
 _MOST = 3
 """Numbers in a sentence; the table lists all."""
-_HEAD = ("", "number", "before -> after", "difference [95 %]", "runs differ")
+_HEAD = (
+    Column("result", wide=True),
+    Column("number"),
+    Column("before -> after"),
+    Column("difference [95 %]"),
+    Column("runs differ"),
+)
 _SPREAD_UNKNOWN = "how much runs of this robot differ without a change is not known"
 _FEWEST = 3
 """Runs a side from which on they tell how much runs differ."""
@@ -27,6 +33,11 @@ _FEWEST = 3
 
 def format_check(check: RunsCheck) -> str:
     """What changed, and whether it is more than runs differ, in one to three sentences."""
+    return " ".join(f"{text[:1].upper()}{text[1:]}." for text in list_check_sentences(check))
+
+
+def list_check_sentences(check: RunsCheck) -> list[str]:
+    """The sentences of `format_check`, without capitals and periods."""
     is_few = min(len(check.sides.before), len(check.sides.after)) < _FEWEST
     unknown = f"{_SPREAD_UNKNOWN}{': three runs a side, or other runs, tell' * is_few}"
     changed, differs = check.list_status("changed"), check.list_status("differs")
@@ -62,7 +73,7 @@ def format_check(check: RunsCheck) -> str:
         counts = f"{outcomes.count('kept')} of {len(outcomes)} limits kept"
         counts += f", {outcomes.count('undetermined')} cannot be judged" * ("undetermined" in outcomes)
         sentences.append(f"{counts}, broken: {broken}" if broken else counts)
-    return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
+    return sentences
 
 
 def _list(numbers: list[CheckedNumber]) -> str:
@@ -90,9 +101,9 @@ def _format(number: CheckedNumber, value: float) -> str:
     return f"{value:.3g}{suffix_unit(number.unit)}"
 
 
-def tabulate_check(check: RunsCheck) -> list[tuple[str, ...]]:
-    """The table of a check: a head, then a row a number; differences of shares are in percent."""
-    rows = []
+def tabulate_check(check: RunsCheck) -> Table:
+    """The table of a check: a row a number; differences of shares are in percent."""
+    rows: list[list[str | Cell]] = []
     for one in check.numbers:
         scale, unit = (100.0, " %") if one.is_ratio else (1.0, suffix_unit(one.unit))
         difference, spread = "", ""
@@ -103,8 +114,34 @@ def tabulate_check(check: RunsCheck) -> list[tuple[str, ...]]:
             spread = size if math.isfinite(one.spread) else "not known"
         before, after = _format(one, one.before), _format(one, one.after)
         before = before.removesuffix(f" {after.partition(' ')[2]}")
-        rows.append((one.status, one.title, f"{before} -> {after}", difference, spread))
-    return [_HEAD, *rows]
+        status = Cell(one.status, strong=one.status == "changed")
+        rows.append([status, one.title, f"{before} -> {after}", difference, spread])
+    note = "" if check.is_spread_known else "intervals: of these recordings alone"
+    return Table("Numbers before and after", _HEAD, rows, note)
+
+
+def tabulate_limits(check: RunsCheck) -> Table:
+    """The limits of a check, and whether they are kept."""
+    rows: list[list[str | Cell]] = [
+        [f"{one.name}: {one.limit}", one.measured, Cell(one.outcome, strong=one.outcome == "broken")]
+        for one in check.limits
+    ]
+    return Table("Limits", (Column("limit"), Column("measured"), Column("outcome")), rows)
+
+
+def list_compared(check: RunsCheck) -> list[Line]:
+    """The runs of both sides and those that tell how much runs differ, and on which terrains they were."""
+    sides = check.sides
+    others = [one for runs in sides.others.values() for one in runs]
+    lines = [
+        (label, f"{len(runs)}: {', '.join(one.run for one in runs)}")
+        for label, runs in (("before", sides.before), ("after", sides.after), ("others", others))
+        if runs
+    ]
+    before, after = (" and ".join(one) for one in sides.terrains)
+    if before and after and before != after:
+        lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
+    return lines
 
 
 def list_check_lines(check: RunsCheck) -> list[Line]:
@@ -112,30 +149,17 @@ def list_check_lines(check: RunsCheck) -> list[Line]:
     lines = [("verdict", format_check(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     table = tabulate_check(check)
-    lines += [(row[0], text) for row, text in zip(table, align_rows([row[1:] for row in table]), strict=True)]
-    if not check.is_spread_known:
-        lines.append(("", "intervals: of these recordings alone"))
-    sides = check.sides
-    others = [one for runs in sides.others.values() for one in runs]
-    for label, runs in (("before", sides.before), ("after", sides.after), ("others", others)):
-        lines += [(label, f"{len(runs)}: {', '.join(one.run for one in runs)}")] if runs else []
-    before, after = (" and ".join(one) for one in sides.terrains)
-    if before and after and before != after:
-        lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
-    return lines + [("note", note) for note in sides.notes]
+    labels = ["", *(str(row[0]) for row in table.rows)]
+    lines += zip(labels, table.align(), strict=False)
+    lines += [("", table.note)] if table.note else []
+    return [*lines, *list_compared(check), *(("note", note) for note in check.sides.notes)]
 
 
 def format_markdown(check: RunsCheck) -> str:
     """The check as Markdown: verdict, limits, and the table of the screen."""
-    limits = [("limit", "measured", "outcome")]
-    limits += [(f"{one.name}: {one.limit}", one.measured, one.outcome) for one in check.limits]
-    parts = [f"**{_escape(format_check(check))}**"]
-    for head, *rows in (limits, tabulate_check(check)):
-        if rows:
-            lines = [head, ["---"] * len(head), *([*map(_escape, row)] for row in rows)]
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
-    parts += [f"> {_escape(note)}" for note in check.sides.notes]
-    return "\n\n".join(parts) + "\n"
+    tables = [one.to_markdown(_escape) for one in (tabulate_limits(check), tabulate_check(check)) if one.rows]
+    notes = [f"> {_escape(note)}" for note in check.sides.notes]
+    return "\n\n".join([f"**{_escape(format_check(check))}**", *tables, *notes]) + "\n"
 
 
 def _escape(text: str) -> str:
@@ -156,10 +180,9 @@ def format_junit(check: RunsCheck) -> str:
         ("limit", f"{one.name}: {one.limit}", one.outcome, f"{one.measured}, limit {one.limit}")
         for one in check.limits
     ]
-    texts = tabulate_check(check)[1:]
     cases += [
-        ("number", one.name, one.status, "  ".join(row))
-        for one, row in zip(check.numbers, texts, strict=True)
+        ("number", one.name, one.status, "  ".join(map(str, row)))
+        for one, row in zip(check.numbers, tabulate_check(check).rows, strict=True)
     ]
     counts = {kind: sum(kinds.get(case[2]) == kind for case in cases) for kind in ("failure", "skipped")}
     suite = ET.Element(

@@ -1,6 +1,7 @@
 """The answer of a comparison in sentences: which ground is harder, as driven and at equal driving."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 
 import polars as pl
 
@@ -10,6 +11,7 @@ from pipeline.core import (
     format_count,
     format_share,
     format_two,
+    group_by,
     number_in,
     split_interval,
 )
@@ -25,31 +27,132 @@ from pipeline.datasets import (
     Causes,
     judge_pair,
 )
+from pipeline.datasets.causes import CausePart
+from pipeline.datasets.levels import LEVEL
+from pipeline.words.tables import NOTHING, Cell, Column, Table
 
 _GROUND = "ground alone"
 
 
-def list_answer(answer: Answer, *, main_only: bool = False) -> list[tuple[str, str, str]]:
-    """The answer: vehicles with the input, what is compared, and a sentence; two lines each.
+@dataclass(frozen=True)
+class AnswerRow:
+    """One row of the answer of a comparison.
+
+    Attributes:
+        of: vehicles with the main input.
+        driving: what is compared: `as driven`, `at equal driving`, `ground alone`, ...
+        text: the hardest and the easiest dataset, and how many pairs differ.
+        input, quantity: the view that it is of.
+    """
+
+    of: str
+    driving: str
+    text: str
+    input: str
+    quantity: str
+
+
+def list_answer(answer: Answer) -> list[AnswerRow]:
+    """The answer, by vehicles: on the main input as driven and at equal driving, then on the other one.
+
+    What the measured wheels show beside the commands is what the ground does alone.
+    """
+    # Of the other input what is compared at equal driving says most, and comes first.
+    views = sorted(
+        answer.views, key=lambda view: (view[0] != answer.input) * (1 + (view[1] != EQUAL_DRIVING))
+    )
+    return [
+        _answer(answer, family, datasets, view)
+        for family, datasets in answer.families.items()
+        for view in views
+    ]
+
+
+def _answer(answer: Answer, family: str, datasets: Sequence[str], view: tuple[str, str]) -> AnswerRow:
+    source, quantity = view
+    levels = answer.take(answer.levels, view).filter(pl.col("dataset").is_in(list(datasets)))
+    pairs = answer.take(answer.comparisons, view).rows(named=True)
+    own = [row for row in pairs if row["a"] in datasets and row["b"] in datasets]
+    text = _describe(levels.sort("value", descending=True), own, equal=quantity == EQUAL_DRIVING)
+    about = QUANTITIES[quantity]
+    if source != answer.input:
+        other = _GROUND if source == "measured" else INPUT_WORDS[source]
+        about = other if quantity == EQUAL_DRIVING else f"{other}, {about}"
+    return AnswerRow(f"{family}, {INPUT_WORDS[answer.input]}", about, text, source, quantity)
+
+
+def tabulate_answer(answer: Answer) -> Table:
+    """The answer as a table: vehicles, what is compared, and what came out."""
+    rows = [[row.of, row.driving, row.text] for row in list_answer(answer)]
+    return Table("Which is harder", (Column("slip of"), Column("compared"), Column("answer")), rows)
+
+
+def tabulate_datasets(answer: Answer, source: str) -> Table:
+    """Datasets on an input: levels with their intervals, and how much was driven.
 
     Args:
         answer: the comparison.
-        main_only: of the other input only what the ground alone does: measured wheels at equal driving.
+        source: `command` or `measured`.
     """
-    lines = []
-    for source, quantity in sorted(answer.views, key=lambda view: view[0] != answer.input):
-        is_ground = main_only and source != answer.input
-        if is_ground and (source, quantity) != ("measured", EQUAL_DRIVING):
-            continue
-        levels = answer.take(answer.levels, (source, quantity))
-        pairs = answer.take(answer.comparisons, (source, quantity)).rows(named=True)
-        for family, datasets in answer.families.items():
-            own = levels.filter(pl.col("dataset").is_in(list(datasets))).sort("value", descending=True)
-            rows = [row for row in pairs if row["a"] in datasets and row["b"] in datasets]
-            text = _describe(own, rows, equal=quantity == EQUAL_DRIVING)
-            title = f"{family}, {INPUT_WORDS[answer.input if is_ground else source]}"
-            lines.append((title, _GROUND if is_ground else QUANTITIES[quantity], text))
-    return sorted(lines, key=lambda line: [one for one, _, _ in lines].index(line[0]))
+    quantities = [quantity for one, quantity in answer.views if one == source]
+    frame = answer.datasets.filter(pl.col("input").cast(pl.String) == source)
+    columns = [Column("dataset"), Column("runs", number=True)]
+    for quantity in quantities:
+        columns += [Column(QUANTITIES[quantity], "m/s", number=True), Column("95 %")]
+    columns += [
+        Column("interval", wide=True),
+        Column("2 s window norm", "m/s", number=True, wide=True),
+        Column("distance", "m", number=True, wide=True),
+        Column("duration", "s", number=True, wide=True),
+        Column("samples", number=True, wide=True),
+    ]
+    levels = {
+        quantity: {
+            str(row["dataset"]): row
+            for row in answer.take(answer.levels, (source, quantity)).sort("value").iter_rows(named=True)
+        }
+        for quantity in quantities
+    }
+    # The easiest first; those without a level last.
+    order = list(dict.fromkeys([*levels[quantities[0]], *frame["dataset"].sort()]))
+    rows = []
+    for row in sorted(frame.iter_rows(named=True), key=lambda row: order.index(row["dataset"])):
+        own = [levels[quantity].get(row["dataset"], {}) for quantity in quantities]
+        cells = [text for one in own for text in (_format_cell(one.get("value")), _format_ends(one))]
+        driven = [_format_cell(row[name], 0) for name in ("distance", "duration", "samples")]
+        norm = _format_cell(row["median_window_norm"])
+        rows.append(
+            [str(row["dataset"]), str(row["runs"]), *cells, own[0].get("interval", ""), norm, *driven]
+        )
+    caption = f"Datasets: {answer.measure} {INPUT_WORDS[source]}"
+    return Table(caption, columns, rows).drop_empty()
+
+
+def tabulate_pairs(answer: Answer, view: tuple[str, str]) -> Table:
+    """Pairs of datasets of one view, those that differ most surely first."""
+    source, quantity = view
+    frame = answer.take(answer.comparisons, view).sort("p_adjusted", "a", "b", nulls_last=True)
+    rows: list[list[str | Cell]] = [
+        [
+            Cell(f"{row['b']} / {row['a']}", strong=judge_pair(row) == DIFFERENT),
+            format_ratio(row, str(row["b"])),
+            _format_cell(row["p_adjusted"]),
+            _format_within(row, "shift"),
+            *(_format_cell(row[name]) for name in ("cliffs_delta", "p", "spread", "freedom", "overlap")),
+            *(str(row[name] or "") for name in ("size", "method", "note")),
+        ]
+        for row in frame.iter_rows(named=True)
+    ]
+    numbers = ("Cliff's delta", "p", "spread of runs", "freedom", "overlap of driving")
+    columns = (
+        Column("times as much slip"),
+        Column("ratio [95 %]"),
+        Column("p adjusted", number=True),
+        Column("difference [95 %]", "m/s", wide=True),
+        *(Column(title, number=True, wide=True) for title in numbers),
+        *(Column(title, wide=True) for title in ("size", "method", "note")),
+    )
+    return Table(f"Pairs {QUANTITIES[quantity]}, {INPUT_WORDS[source]}", columns, rows).drop_empty()
 
 
 def _describe(levels: pl.DataFrame, pairs: list[dict[str, object]], *, equal: bool) -> str:
@@ -112,9 +215,7 @@ def summarize_answer(answer: Answer) -> dict[str, object]:
             }
             for source, quantity in answer.views
         ],
-        "answer": [
-            {"of": title, "driving": about, "text": text} for title, about, text in list_answer(answer)
-        ],
+        "answer": [asdict(row) for row in list_answer(answer)],
         "notes": list(answer.notes),
     }
 
@@ -178,29 +279,21 @@ def format_answer(answer: Answer, *, everything: bool) -> list[str]:
         everything: also the tables of datasets and pairs, and all notes.
     """
     lines: list[str] = []
-    title = ""
-    for head, about, text in list_answer(answer, main_only=not everything):
-        lines += ([""] * bool(lines) + [f"slip of {head}"]) * (head != title)
-        title = head
-        lines.append(f"  {about:<18}{text}")
+    shown = [
+        row
+        for row in list_answer(answer)
+        # Of the other input the ground alone at equal driving is what everybody reads.
+        if everything or row.input == answer.input or (row.input, row.quantity) == ("measured", EQUAL_DRIVING)
+    ]
+    for of, rows in group_by((row.of, (row.driving, row.text)) for row in shown).items():
+        lines += [*([""] * bool(lines)), f"slip of {of}", *(f"  {line}" for line in align_rows(rows))]
+    for source in dict.fromkeys(one for one, _ in answer.views) if everything else ():
+        datasets = tabulate_datasets(answer, source)
+        lines += ["", datasets.caption, *datasets.align()]
     for view in answer.views if everything else ():
-        about = f"{QUANTITIES[view[1]]}, {INPUT_WORDS[view[0]]}"
-        levels = [
-            (row["dataset"], _format_cell(row["value"]), _format_ends(row), row["interval"])
-            for row in answer.take(answer.levels, view).sort("value").iter_rows(named=True)
-        ]
-        pairs = [
-            (f"{row['b']} / {row['a']}", format_ratio(row, row["b"]), _format_cell(row["p_adjusted"]))
-            for row in answer.take(answer.comparisons, view)
-            .sort("p_adjusted", nulls_last=True)
-            .iter_rows(named=True)
-        ]
-        lines += ["", *align_rows([(f"{answer.measure} {about}", "m/s", "95 % interval", ""), *levels])]
-        lines += [
-            "",
-            *align_rows([("times as much slip", "ratio", "p adjusted"), *pairs[:_MOST_PAIRS]]),
-        ] * bool(pairs)
-        omitted = len(pairs) - _MOST_PAIRS
+        pairs = tabulate_pairs(answer, view)
+        lines += ["", pairs.caption, *pairs.align()[: 1 + _MOST_PAIRS]] * bool(pairs.rows)
+        omitted = len(pairs.rows) - _MOST_PAIRS
         lines += [f"... and {omitted} more pairs on the page"] * (omitted > 0)
     others = [
         INPUT_WORDS[name] for name in dict.fromkeys(one for one, _ in answer.views) if name != answer.input
@@ -210,12 +303,69 @@ def format_answer(answer: Answer, *, everything: bool) -> list[str]:
     return [*lines, *_list_notes(list_shown_notes(answer), everything)]
 
 
-def _format_cell(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, int | float) else "-"
+def _format_cell(value: object, places: int | None = None) -> str:
+    if not isinstance(value, int | float):
+        return NOTHING
+    return f"{value:.3g}" if places is None else f"{value:,.{places}f}"
 
 
 def _format_ends(row: Mapping[str, object]) -> str:
+    """The ends of a value's interval."""
     value, low, high = (row.get(key) for key in ("value", "low", "high"))
     if not (isinstance(value, float) and isinstance(low, float) and isinstance(high, float)):
-        return "-"
+        return NOTHING
     return " to ".join(split_interval(value, low, high)[1:])
+
+
+def _format_within(row: Mapping[str, object], name: str) -> str:
+    """A value with its interval in brackets."""
+    ends = _format_ends({**row, "value": row[name]})
+    return _format_cell(row[name]) + (f" [{ends.replace(' to ', ', ')}]" if ends != NOTHING else "")
+
+
+def tabulate_causes(causes: Causes) -> list[Table]:
+    """The budgets by cause, and the differences of two of them."""
+
+    def format_ends(part: CausePart, form: Callable[[float], str]) -> str:
+        known = part.low is not None and part.high is not None
+        return f"{form(part.low or 0.0)} to {form(part.high or 0.0)}" if known else NOTHING
+
+    def format_part(value: float) -> str:
+        return format_share(value, 1)
+
+    budgets = [
+        [
+            one.dataset,
+            causes.names.get(part.name, part.name),
+            format_part(part.value),
+            format_ends(part, format_part),
+        ]
+        for one in causes.budgets
+        for part in one.parts
+    ]
+    differences: list[list[str | Cell]] = [
+        [
+            f"{one.b} \u2212 {one.a}",
+            Cell(
+                causes.names.get(part.name, part.name),
+                strong=part.p_adjusted is not None and part.p_adjusted <= LEVEL,
+            ),
+            format_two(part.value),
+            format_ends(part, format_two),
+            _format_cell(part.p_adjusted),
+        ]
+        for one in causes.differences
+        for part in one.parts
+    ]
+    head = (Column("dataset"), Column("cause"))
+    shares = (*head, Column("share", number=True), Column("95 %"))
+    parts = (
+        *head,
+        Column("difference", "m/s", number=True),
+        Column("95 %"),
+        Column("p adjusted", number=True),
+    )
+    return [
+        Table("Budgets: shares of the mean square slip, means over runs", shares, budgets),
+        Table("Differences of RMS slip by cause; p over the causes of a pair", parts, differences),
+    ]

@@ -1,47 +1,83 @@
-"""Runs together on one screen: parameters of a fleet by level, their course over dates, the map."""
+"""Runs together: parameters of a fleet by level, their course over dates, the map."""
 
-from pipeline.core import INPUT_WORDS, align_rows, format_count, suffix_unit
+from pipeline.core import INPUT_WORDS, format_count, format_digits, suffix_unit
 from pipeline.datasets import Band, DeploymentMap, Fleet, Series, Trend
 from pipeline.models import name_number
+from pipeline.words.tables import NOTHING, Cell, Column, Table
 
 _SLIP = {"median_modulus": "median slip modulus", "median_window_norm": "slip over 2 s windows"}
 _MOST_NUMBERS = 8
 """Parameters of a vehicle on a screen of 24 lines, those of most runs first."""
 
 
+def tabulate_fleet(fleet: Fleet, *, everything: bool = True) -> list[Table]:
+    """Parameters by vehicle, each with the bands of another run, and of its terrains.
+
+    Args:
+        fleet: the parameters of all runs.
+        everything: also all terrains, and parameters of few runs.
+    """
+    tables = []
+    for vehicle, runs in fleet.runs.items():
+        own = [one for one in fleet.numbers if one.vehicle == vehicle]
+        shown = own if everything else own[:_MOST_NUMBERS]
+        rows: list[list[str | Cell]] = []
+        for one in shown:
+            spreads = [_format(spread) for spread in (one.spread_terrain, one.spread_run)]
+            whole = [*_format_band(one.whole), suffix_unit(one.unit).strip(), one.level or "open"]
+            rows.append(
+                [Cell(one.label, strong=True), *whole, str(one.whole.runs), *spreads, one.name, one.because]
+            )
+            is_split = everything or one.level == "terrain"
+            rows += [
+                [f"  on {name}", *_format_band(band), "", "", str(band.runs), *[""] * 4]
+                for name, band in one.terrains.items()
+                if is_split
+            ]
+        hidden = len(own) - len(shown)
+        note = f"{format_count(hidden, 'more parameter')}: --all, or the page" if hidden else ""
+        tables.append(Table(f"{vehicle}: {format_count(len(runs), 'run')}", _FLEET, rows, note))
+    return [one for one in tables if one.rows]
+
+
+_FLEET = (
+    Column("parameter"),
+    Column("value", number=True),
+    Column("95 %"),
+    Column("another run"),
+    Column("unit"),
+    Column("level"),
+    Column("runs", number=True, wide=True),
+    Column("spread between terrains", number=True, wide=True),
+    Column("between runs", number=True, wide=True),
+    Column("name", wide=True),
+    Column("because", wide=True),
+)
+
+
+def _format(value: float | None) -> str:
+    return NOTHING if value is None else f"{value:.3g}"
+
+
+def _format_band(band: Band) -> tuple[str, str, str]:
+    ends = [(band.low, band.high), (band.another_low, band.another_high)]
+    texts = [NOTHING if low is None or high is None else f"{low:.3g} to {high:.3g}" for low, high in ends]
+    return _format(band.value), texts[0], texts[1]
+
+
 def format_fleet(fleet: Fleet, *, everything: bool) -> list[str]:
-    """Parameters by vehicle, with the bands of another run.
+    """Parameters by vehicle, with the bands of another run, on one screen.
 
     Args:
         fleet: the parameters of all runs.
         everything: also all terrains, and why each number has its level.
     """
     lines = [fleet.summary]
-    for vehicle, runs in fleet.runs.items():
-        own = [one for one in fleet.numbers if one.vehicle == vehicle]
-        shown = own if everything else own[:_MOST_NUMBERS]
-        rows = [("level", "parameter", "value", "95 %", "another run", "unit")]
-        for one in shown:
-            rows.append(
-                (one.level or "open", one.label, *_format_band(one.whole), suffix_unit(one.unit).strip())
-            )
-            is_split = everything or one.level == "terrain"
-            rows += [
-                ("", f"  on {name}", *_format_band(band), "")
-                for name, band in one.terrains.items()
-                if is_split
-            ]
-        lines += ["", f"{vehicle}: {format_count(len(runs), 'run')}", *align_rows(rows)] if own else []
-        hidden = len(own) - len(shown)
-        lines += [f"{format_count(hidden, 'more parameter')}: --all, or the page"] if hidden else []
-        lines += [f"{one.label}: {one.name}, {one.because}" for one in shown if everything]
+    for table in tabulate_fleet(fleet, everything=everything):
+        lines += ["", table.caption, *table.align(), *([table.note] if table.note else [])]
+    lines += [""] * everything
+    lines += [f"{one.label}: {one.name}, {one.because}" for one in fleet.numbers if everything]
     return [*lines, *(f"! {note}" for note in fleet.notes)]
-
-
-def _format_band(band: Band) -> tuple[str, str, str]:
-    ends = [(band.low, band.high), (band.another_low, band.another_high)]
-    texts = ["-" if low is None or high is None else f"{low:.3g} to {high:.3g}" for low, high in ends]
-    return f"{band.value:.3g}", texts[0], texts[1]
 
 
 def name_series(series: Series) -> str:
@@ -53,21 +89,71 @@ def name_series(series: Series) -> str:
     return f"{_SLIP[name]} {INPUT_WORDS[source]}"
 
 
+def list_series(trend: Trend) -> list[Series]:
+    """The series that people read: window norms, which say what medians say, stay in the JSON."""
+    return [one for one in trend.series if not one.quantity.startswith("median_window")]
+
+
+def tabulate_trend(trend: Trend) -> Table:
+    """Each series with its latest value and its largest step."""
+    rows: list[list[str | Cell]] = [
+        [name_series(one), one.group, Cell(one.describe(), strong=one.is_changed)]
+        for one in list_series(trend)
+    ]
+    return Table("All series", (Column("quantity"), Column("of"), Column("course")), rows)
+
+
 def format_trend(trend: Trend) -> list[str]:
     """Each series with its largest step, and notes."""
-    lines = align_rows([(one.group, one.quantity, one.describe()) for one in trend.series])
-    return [*lines, *(f"! {note}" for note in trend.notes)]
+    return [*tabulate_trend(trend).align(), *(f"! {note}" for note in trend.notes)]
+
+
+def tabulate_map(drawn: DeploymentMap) -> list[Table]:
+    """Own datasets with their energy, complexity and measure, and the deployments of the literature."""
+    places = (
+        Column("energy", "J", number=True),
+        Column("complexity", number=True),
+    )
+    own: list[list[str | Cell]] = [
+        [
+            str(row["dataset"]), format_digits(row["energy"], 3), _format(row["complexity"]),
+            _format(row["value"]), str(row["vehicle"]), str(row["terrain"]), str(row["runs"]),
+        ]
+        for row in drawn.own.iter_rows(named=True)
+    ]  # fmt: skip
+    literature: list[list[str | Cell]] = [
+        [
+            str(row["key"]), str(row["vehicle"]), str(row["terrain"]), format_digits(row["energy"], 3),
+            _format(row["complexity"]), str(row["bound"]), "yes" if row["sure"] else "no", str(row["title"]),
+            str(row["year"]),
+        ]
+        for row in drawn.points.iter_rows(named=True)
+    ]  # fmt: skip
+    about = f"{drawn.measure.name} {INPUT_WORDS[drawn.input]}"
+    measure = Column(drawn.measure.name, drawn.measure.unit, number=True)
+    driven = (
+        Column("vehicle", wide=True),
+        Column("terrain", wide=True),
+        Column("runs", number=True, wide=True),
+    )
+    known = (Column("energy is"), Column("known well"), Column("title"), Column("year", number=True))
+    return [
+        Table(
+            f"Own datasets: largest kinetic energy of a run, {about}",
+            (Column("dataset"), *places, measure, *driven),
+            own,
+        ),
+        Table(
+            "The literature",
+            (Column("key"), Column("vehicle"), Column("terrain"), *places, *known),
+            literature,
+        ),
+    ]
 
 
 def format_map(drawn: DeploymentMap) -> list[str]:
     """Own datasets with their energy, complexity and measure, and notes."""
-    measure, unit = drawn.measure, suffix_unit(drawn.measure.unit)
-    lines = [
-        f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
-        f"{measure.name} {'-' if row['value'] is None else format(row['value'], '.3g')}{unit}"
-        for row in drawn.own.iter_rows(named=True)
-    ]
-    return [*lines, *(f"! {note}" for note in drawn.notes)]
+    return [*tabulate_map(drawn)[0].align(), *(f"! {note}" for note in drawn.notes)]
 
 
 def summarize_map(drawn: DeploymentMap) -> str:

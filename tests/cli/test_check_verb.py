@@ -2,6 +2,7 @@
 
 import html
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,20 @@ def test_limits_gate_a_build_and_the_report_is_a_file(place: Path) -> None:
     assert 'failures="1"' in broken
     markdown = check(place, "husky.toml", LATE_RUNS, "--to", "markdown", code=4)
     assert markdown.startswith("**Changed: lag of the drive")
+
+
+def test_the_page_of_a_check_is_a_file_that_shows_the_table_of_the_screen(place: Path) -> None:
+    screen = check(place, "husky.toml", LATE_RUNS, code=4)
+    check(place, "husky.toml", LATE_RUNS, "--to", "html", "--file", "check.html", "--quiet", code=4)
+    page = (place / "check.html").read_text(encoding="utf-8")
+
+    text = html.unescape(re.sub(r"<[^>]+>", " ", page))
+    (row,) = (line for line in screen.splitlines() if line.startswith("changed"))
+    for cell in re.split(r" {2,}", row):
+        assert cell.replace("-> ", "") in text.replace("-> ", ""), cell
+    assert page.startswith("<!DOCTYPE html>")
+    assert "script-src 'none'" in page
+    assert (place / "logs/late.mcap").stem in text, "the compared runs are named"
 
 
 def test_a_folder_stands_for_its_logs(place: Path) -> None:

@@ -1,7 +1,9 @@
 """Grounds at equal driving: what the driving did falls away, and what cannot be compared has no number."""
 
 import itertools
+import re
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,9 @@ from pipeline.datasets.compare import AS_DRIVEN, EQUAL_DRIVING, Answer, compare_
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
 from pipeline.datasets.levels import fit_levels
+from pipeline.report.datasets_page import write_answer
 from pipeline.store import Store
-from pipeline.words import list_answer
+from pipeline.words import format_answer, list_answer, summarize_answer
 
 RATE = 20.0
 FACTORS = {"command": 1.0, "measured": 0.5}
@@ -186,15 +189,13 @@ def answer(tmp_path: Path) -> Answer:
 
 
 def test_both_questions_are_answered_on_both_inputs_within_a_vehicle(answer: Answer) -> None:
-    lines = list_answer(answer)
-    kinds = ("as driven", "at equal driving")
-    assert sorted(line[:2] for line in lines) == sorted(
-        (f"{vehicle}, {words}", kind)
-        for vehicle in ("husky", "warthog")
-        for words in ("from commands", "from wheel encoders")
-        for kind in kinds
-    )
-    texts = {line[:2]: line[2] for line in lines}
+    rows = list_answer(answer)
+    kinds = ("as driven", "at equal driving", "ground alone", "ground alone, as driven")
+    assert [(row.of, row.driving) for row in rows] == [
+        (f"{vehicle}, from commands", kind) for vehicle in ("husky", "warthog") for kind in kinds
+    ]
+    assert [row.input for row in rows] == ["command", "command", "measured", "measured"] * 2
+    texts = {(row.of, row.driving): row.text for row in rows}
     assert texts["husky, from commands", "as driven"].endswith(" m/s")
     assert texts["warthog, from commands", "as driven"].startswith("warthog_ice (1.5 m/s) hardest, ")
     assert texts["warthog, from commands", "as driven"].endswith("; 2 of 3 pairs significant")
@@ -206,6 +207,25 @@ def test_both_questions_are_answered_on_both_inputs_within_a_vehicle(answer: Ans
     sure = pairs.filter(pl.col("p_adjusted") <= 0.05)
     assert set(sure["b"]) == {"warthog_ice"}
     assert sure.height == 2
+
+
+def test_the_answer_is_one_table_on_the_screen_in_json_and_on_the_page(
+    answer: Answer, tmp_path: Path
+) -> None:
+    written = write_answer(Store(tmp_path / "pages"), answer)
+    page = written["comparison.html"].read_text(encoding="utf-8")
+    content = summarize_answer(answer)["answer"]
+    screen = [" ".join(line.split()) for line in format_answer(answer, everything=True)]
+    rows = list_answer(answer)
+    assert content == [asdict(row) for row in rows]
+    for row in rows:
+        assert f"{row.driving} {row.text}" in screen
+        cells = (f"<td[^>]*>{re.escape(text)}</td>" for text in (row.driving, row.text))
+        assert re.search(f"{re.escape(row.of)}</th>{''.join(cells)}", page)
+    # In short, the screen has of the other input what everybody asks: the ground alone.
+    short = [" ".join(line.split()) for line in format_answer(answer, everything=False)]
+    kinds = [row.driving for row in rows if f"{row.driving} {row.text}" in short]
+    assert kinds == ["as driven", "at equal driving", "ground alone"] * 2
 
 
 def test_a_pair_has_one_driving_in_common_whichever_call_asks(tmp_path: Path) -> None:

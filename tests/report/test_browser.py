@@ -98,6 +98,38 @@ def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(
     assert str(chrome.run(said)).startswith("Marked 12.0\u201316.0 s")
 
 
+def test_signals_of_ones_choice_are_drawn_and_zoomed_with_the_others(
+    page: str, chrome: Chrome, tmp_path: Path
+) -> None:
+    open_page(chrome, page, tmp_path, PHONE)
+    chrome.click("#signals > summary")
+    chrome.wait("!document.querySelector('#signals .plot:not(.drawn)')")
+    paths = "document.querySelectorAll('[data-figure=signals] .mark-line path')"
+    lines = f"[...{paths}].map((path) => path.getAttribute('d'))"
+    first = cast("list[str]", chrome.run(lines))
+    assert len(first) == 2
+    assert all("NaN" not in line and len(line) > 500 for line in first)
+    chrome.run(
+        "{const choice = document.querySelectorAll('.signal')[1];"
+        " choice.value = 'g_w'; choice.dispatchEvent(new Event('change'))}"
+    )
+    chrome.wait(f"{lines}[1] !== {json.dumps(first[1])}")
+    drawn = cast("list[str]", chrome.run(lines))
+    assert drawn[0] == first[0]
+    assert "NaN" not in drawn[1]
+    said = str(chrome.run("document.querySelector('[data-figure=signals]').getAttribute('aria-label')"))
+    assert said == "Over time: v_x of velocities and g_w of slip from commands."
+    chrome.drag("[data-figure=signals]", (0.4, 0.2), (0.7, 0.2))
+    chrome.wait("!document.getElementById('marked').hidden")
+    chrome.click("#zoom-in")
+    chrome.wait(f"{lines}[0] !== {json.dumps(first[0])}")
+    chosen = cast(
+        "list[str]", chrome.run("[...document.querySelectorAll('.signal')].map((one) => one.value)")
+    )
+    assert chosen == ["v_x", "g_w"], "zooming keeps what was chosen"
+    assert chrome.errors == []
+
+
 @pytest.mark.long
 def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(
     page: str, chrome: Chrome, tmp_path: Path

@@ -17,6 +17,7 @@ from pipeline.report import (
     show_text,
 )
 from pipeline.report.page import render_report
+from pipeline.report.pages import Page
 from pipeline.report.scene import RunReport
 
 TEMPLATES = Path(report.__file__).parents[1]
@@ -134,7 +135,7 @@ def test_text_out_of_a_log_stays_text() -> None:
     for key in ["run", "vehicle", "terrain", "dataset", "topic", "reason", "finding", "where"]:
         page = render_report(make_report(duration_s=20.0, names={key: HOSTILE}))
         outline = outline_of(page)
-        assert len(outline.scripts) == 3
+        assert len(outline.scripts) == 4
         assert not any(tag == "img" for tag, _ in outline.tags)
         assert outline.open == []
         assert "alert(1)</script>" not in page
@@ -157,14 +158,14 @@ def test_names_of_any_length_and_several_lines_stay_in_their_places() -> None:
 
 
 def test_rows_of_figures_can_neither_end_their_element_nor_start_a_comment() -> None:
-    values = {"title": "", "facts": [], "style": "", "scripts": []}
-    page = render_template("report/templates/figures.html", data={HOSTILE: [HOSTILE]}, **values)
+    values = {"title": "", "page": Page("", [], []), "style": "", "scripts": []}
+    page = render_template("report/templates/page.html", data={HOSTILE: [HOSTILE]}, **values)
     outline = outline_of(page)
     packed = outline.scripts[0][1]
     assert not set("<>&'\u2028\u2029") & set(packed)
     assert data_of(outline) == {HOSTILE: [HOSTILE]}
     with pytest.raises(ValueError, match="not JSON compliant"):
-        render_template("report/templates/figures.html", data={"rows": float("nan")}, **values)
+        render_template("report/templates/page.html", data={"rows": float("nan")}, **values)
 
 
 def test_what_cannot_be_seen_is_shown_and_a_lone_surrogate_can_be_written() -> None:

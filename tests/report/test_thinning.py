@@ -1,9 +1,24 @@
+import base64
+import json
+from typing import Any
+
 import numpy as np
 import polars as pl
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from report_synthesis import Floats, make_report
 
-from pipeline.report.scene import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
+from pipeline.report.figures.signal_figures import Signals, thin_to_ends, view_signals
+from pipeline.report.scene import (
+    RunReport,
+    Scene,
+    break_lines,
+    drop_flat_rows,
+    find_spans,
+    thin_series,
+    thin_to_peaks,
+)
 
 
 @st.composite
@@ -59,3 +74,53 @@ def test_spans_end_one_period_after_their_last_row_and_never_cross_a_segment() -
     )
     spans = find_spans(rows, "flag", period=0.1)
     assert spans.rows() == [(0.0, 0.2), (0.3, 0.4), (0.4, 0.5)]
+
+
+def read_packed(packed: dict[str, Any], name: str) -> tuple[Floats, Floats]:
+    """Times [s] and values, as the script of the page reads them."""
+    numbers = {
+        key: np.frombuffer(base64.b64decode(text), dtype=kind).astype(np.float64)
+        for key, text, kind in (
+            ("t", packed["t"], "<i4"),
+            ("value", packed["columns"][name]["values"], "<i2"),
+        )
+    }
+    column = packed["columns"][name]
+    values = np.where(numbers["value"] < 0.0, np.nan, column["low"] + column["step"] * numbers["value"])
+    return numbers["t"] / 1e3, values
+
+
+def test_packed_signals_keep_every_peak_and_a_long_run_takes_no_more_room() -> None:
+    sizes = []
+    for duration_s in (60.0, 3000.0):
+        report = make_report(duration_s=duration_s)
+        slip = report.tables["slip"]
+        peak = pl.when(pl.int_range(pl.len()) == 17).then(9.0).otherwise(pl.col("g_x"))
+        slip = slip.with_columns(g_x=peak)
+        scene = Scene(RunReport(report.summary, {**report.tables, "slip": slip}))
+        view = view_signals(scene)
+        packed: dict[str, Any] = view["packed"]  # type: ignore[assignment]
+        t, values = read_packed(packed["slip from commands"], "g_x")
+        whole = slip.filter(pl.col("input") == "command").sort("t")
+        assert np.nanmax(values) == pytest.approx(9.0)
+        assert t.size <= max(3000, whole.height if whole.height <= 3000 else 0)
+        near = t[np.nanargmax(values)] - float(whole["t"][17])
+        assert abs(near) <= 3.0 * duration_s / 3000.0 + 0.06
+        if whole.height <= 3000:
+            np.testing.assert_allclose(values, whole["g_x"].to_numpy(), atol=1e-3)
+            np.testing.assert_allclose(t, whole["t"].to_numpy(), atol=6e-4)
+        assert set(packed) == set(view["tables"])  # type: ignore[call-overload]
+        sizes.append(len(json.dumps(packed)))
+    assert max(sizes) < 500_000
+
+
+def test_missing_values_of_a_signal_break_its_line() -> None:
+    gaps = Signals(
+        "imu", np.array([0.0, 0.1, 0.2, 5.0, 5.1]), {"a": np.array([1.0, np.nan, 2.0, 3.0, 1.0])}, {}
+    )
+    t, values = read_packed(gaps.pack(), "a")
+    np.testing.assert_allclose(t, gaps.t)
+    np.testing.assert_allclose(values, gaps.columns["a"], atol=1e-3)
+    assert gaps.list_rows("a")["value"].to_list() == [1.0, None, 2.0, None, 3.0, 1.0]
+    low_first = thin_to_ends(np.array([3.0, 1.0, 2.0, np.nan, np.nan, np.nan, 5.0]), 3)
+    np.testing.assert_array_equal(low_first, [3.0, 1.0, np.nan, np.nan, 5.0, 5.0])

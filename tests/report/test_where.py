@@ -38,3 +38,29 @@ def test_a_map_far_from_its_origin_counts_from_the_start() -> None:
     np.testing.assert_allclose(shifted.frame["x"] - 0.4, near.frame["x"], atol=1e-6)
     assert "less 5,181,200 m" in render_report(moved)
     assert '"domain":[33' not in render_report(moved)
+
+
+def test_a_speed_that_rests_on_poses_of_one_side_is_not_drawn_and_stays_in_the_tables() -> None:
+    report = make_report(duration_s=200.0)
+    t, segment = pl.col("t"), "segment"
+    to_end = pl.min_horizontal(t - t.min().over(segment), t.max().over(segment) - t)
+    spiked = {
+        name: report.tables[name].with_columns(
+            pl.when(to_end < 0.3).then(40.0).otherwise(column).alias(column)
+        )
+        for name, column in (("velocities", "v_x"), ("slip", "modulus"))
+    }
+    scene = Scene(RunReport(report.summary, {**report.tables, **spiked}, report.diagnosis, report.motion))
+    lines, modulus, track = scene.component_lines("x"), scene.modulus_lines, scene.track
+    assert lines is not None
+    assert modulus is not None
+    assert track is not None
+    assert spiked["velocities"]["v_x"].max() == 40.0
+    for drawn in (lines.frame["value"], modulus.frame["value"], track.frame["modulus"]):
+        assert drawn.count() > 100
+        assert drawn.max() < 20.0  # type: ignore[operator]
+    text = render_report(
+        RunReport(report.summary, {**report.tables, **spiked}, report.diagnosis, report.motion)
+    )
+    assert "40.00 m/s" not in text
+    assert "nearer than 0.38 s to a gap of the poses are not drawn" in text

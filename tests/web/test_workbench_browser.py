@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 from barriers import find_barriers
 from chrome import LAPTOP, PHONE, Chrome
-from workbench_server import ERROR, RUN, SHOWN, TOKEN, ServedWorkbench, look_for_trouble
+from workbench_server import (
+    ERROR,
+    RUN,
+    SHOWN,
+    TOKEN,
+    TRACK,
+    ServedWorkbench,
+    analyze_another,
+    look_for_trouble,
+)
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log, update_datasets
@@ -245,6 +254,35 @@ def test_add_slide_undo_and_save(
     chrome.wait(f"!document.querySelector('.card') && {SETTLED}")
     write_formula(chrome, effect="my_track", formula="k * w0", parameters="k [1] -0.9 .. 0.9")
     chrome.wait("document.querySelector('.card[data-effect=my_track]')")
+    look_for_trouble(chrome)
+
+
+def test_the_errors_on_another_run_stand_beside_those_of_this_one_and_follow_the_model(
+    chrome: Chrome, served: ServedWorkbench, tmp_path: Path
+) -> None:
+    other = analyze_another(served.results, "other", tmp_path, effective_track=TRACK)
+    open_page(
+        chrome, served, PHONE, state=f"{SHOWN} && document.querySelector('.validate').options.length > 1"
+    )
+    if chrome.run(TITLE) != RUN:
+        chrome.click("[data-tab=runs]")
+        chrome.run(f"document.querySelector('.run[title=\"{RUN}\"]').click()")
+        chrome.wait(f"{TITLE} === '{RUN}' && {SHOWN}")
+    said = "document.querySelector('.validated').textContent"
+    choose = (
+        "{const choice = document.querySelector('.validate'); choice.value = '%s';"
+        " choice.dispatchEvent(new Event('change'))}"
+    )
+    chrome.run(choose % other)
+    chrome.wait(f"{said}.endsWith('with the ideal model.')")
+    before = str(chrome.run(said))
+    assert before.startswith(f"{other}: position ")
+    chrome.click(".proposals li[data-effect=effective_track] .add")
+    chrome.wait(f"{said}.endsWith('The model holds there.')")
+    assert "(ideal model " in str(chrome.run(said))
+    chrome.run(choose % "")
+    chrome.wait(f"{said} === ''")
+    assert cast("int", chrome.run(WIDER)) <= 0
     look_for_trouble(chrome)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import time
 from contextlib import closing
 from hashlib import sha256
@@ -11,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from verbs import run_verb
-from workbench_server import RUN, TRACK, Workbench, wait_for
+from workbench_server import RUN, TRACK, Workbench, analyze_another, wait_for
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -149,6 +150,35 @@ def test_no_model_is_fitted_to_a_run_that_cannot_show_slip(workbench: Workbench,
     refused = workbench.refuse("/api/session", run=RUN, action=action, effect="effective_track", anyway=True)
     assert (refused["code"], refused["message"]) == ("no_fit", "it does not move")
     assert change(workbench) == opened
+
+
+def test_a_model_is_validated_on_another_run_with_the_numbers_of_this_one(
+    workbench: Workbench, tmp_path: Path
+) -> None:
+    alike = analyze_another(workbench.results, "alike", tmp_path, effective_track=TRACK)
+    other = analyze_another(workbench.results, "other", tmp_path, effective_track=1.2)
+    added = change(workbench, "add", effect="effective_track")
+    holds = cast("Json", workbench.post("/api/validate", run=RUN, input=added["input"], on=alike))
+    fails = cast("Json", workbench.post("/api/validate", run=RUN, input=added["input"], on=other))
+
+    assert holds["carried"]["r"] < 0.1 * holds["ideal"]["r"]
+    assert holds["warning"] == ""
+    assert fails["carried"]["r"] > 3.0 * fails["own"]["r"]
+    assert "does not transfer to field/other" in fails["warning"]
+    # They are the numbers of the verb, and nothing was fitted to this run anew.
+    path = str(workbench.post("/api/save", run=RUN)["path"])
+    given = (path, shutil.copy(path, tmp_path / "again.toml"), "--on", alike, "--input", added["input"])
+    done = run_verb("model", "compare", *given, "--results", workbench.results, "--json")
+    told = json.loads(done.stdout)["compared"][0]["carried"]
+    assert told["t_mrmse_m"] == pytest.approx(holds["carried"]["t"], rel=1e-6)
+    assert change(workbench) == added
+
+    refused = workbench.refuse("/api/validate", run=RUN, on="field/none")
+    assert refused["code"] == "no_such_run"
+    summary = find_manifest(workbench, other).path("summary.json")
+    still = [{"id": "not_moving", "severity": "error", "values": {"error": "it does not move"}}]
+    summary.write_text(json.dumps(json.loads(summary.read_text()) | {"findings": still}))
+    assert workbench.refuse("/api/validate", run=RUN, on=other)["message"] == "it does not move"
 
 
 FORMULA = {"effect": "own", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}

@@ -250,8 +250,17 @@ def format_bands(scene: Scene, *lines: Thinned) -> str:
         (scene.transitory_spans, "Grey bands: transitory, after a change of command."),
         (scene.suspect_spans, "Red bands: incidents and suspect poses, left out of medians and fits."),
     )
+    bands = [text for spans, text in texts if not spans.is_empty()]
     thinned = format_thinning(*lines, rule="first, last, lowest and highest of every bin")
-    return " ".join(filter(None, [*(text for spans, text in texts if not spans.is_empty()), thinned]))
+    return " ".join(filter(None, [*bands, format_ends(scene), thinned]))
+
+
+def format_ends(scene: Scene) -> str:
+    """Sentence about the ends of segments, where no speed is drawn."""
+    return (
+        f"Measured speeds nearer than {scene.one_sided_s:.2g} s to a gap of the poses are not drawn: "
+        "they rest on poses of one side."
+    )
 
 
 def format_thinning(*lines: Thinned, rule: str) -> str:

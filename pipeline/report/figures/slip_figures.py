@@ -248,7 +248,8 @@ def _format_slip(scene: Scene) -> str:
     """Median, maximum and its time for each input."""
     sentences = []
     for name, frame in scene.sound_slip.items():
-        row = frame.row(frame["modulus"].arg_max() or 0, named=True)
+        drawn = frame.select(pl.when(~pl.col("end")).then("modulus")).to_series()
+        row = frame.row(drawn.arg_max() or 0, named=True)
         sentences.append(
             f"{INPUT_WORDS[name]} its median is {format_number(scene.median_modulus(name))} m/s "
             f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"

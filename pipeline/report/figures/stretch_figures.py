@@ -115,7 +115,8 @@ def draw_motion(scene: Scene) -> Drawing | None:
         panels.append(panel.properties(width=480))
     rows[figures.MARKED_SPANS] = figures.EMPTY_SPANS
     text = "Forward velocity and yaw rate of the stretch: measured, ideal and model."
-    return Drawing(stack(*panels).properties(usermeta=figures.brush_over_time()), rows, words=text)
+    chart = stack(*panels).properties(usermeta=figures.brush_over_time())
+    return Drawing(chart, rows, figures.format_ends(scene), text)
 
 
 def list_motion(scene: Scene) -> dict[str, pl.DataFrame]:
