@@ -64,9 +64,9 @@ def list_values(
         value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
         if not math.isfinite(value):
             continue
-        found, said = known.get(label, _UNKNOWN), noted.get(label, _UNKNOWN)
-        found = replace_fields(found, value=value, doubt=said.doubt, stretches=said.stretches)
-        number = found.doubt_as(parameter)
+        fitted, said = known.get(label, _UNKNOWN), noted.get(label, _UNKNOWN)
+        fitted = replace_fields(fitted, value=value, doubt=said.doubt, stretches=said.stretches)
+        number = fitted.doubt_as(parameter)
         own = number.at_bound or is_of_one_run(effect.parameters)
         numbers[parameter.name] = replace_fields(
             number,

@@ -10,13 +10,13 @@ from typing import Any
 def list_pairs() -> dict[str, dict[str, Any]]:
     """For every effect of `pairs.toml` the attributes of `Effect` that name other effects."""
     table = tomllib.loads(resources.files("pipeline.models").joinpath("pairs.toml").read_text())
-    found: dict[str, dict[str, Any]] = {}
+    relations: dict[str, dict[str, Any]] = {}
     for pair in table.pop("equivalent"):
         for one, other in (pair["effects"], pair["effects"][::-1]):
-            facts = found.setdefault(one, {"equivalent_to": ()})
+            facts = relations.setdefault(one, {"equivalent_to": ()})
             facts["equivalent_to"] += (other,)
             facts["equivalent_when"] = "; ".join(filter(None, (facts.get("equivalent_when"), pair["when"])))
     for relation, others in table.items():
         for name, related in others.items():
-            found.setdefault(name, {})[relation] = tuple(related)
-    return found
+            relations.setdefault(name, {})[relation] = tuple(related)
+    return relations

@@ -414,7 +414,7 @@ def align_poses(
         at_fault = track.times[_mark(track.times, outliers)]
         fit = fit_gyro(track, gyro, np.union1d(excluded, at_fault))
     late, moved = _split_delay(fit, gyro)
-    found = replace(
+    aligned = replace(
         alignment,
         gyro=_put_on_clock(fit, moved),
         heading_delay_s=late,
@@ -422,7 +422,7 @@ def align_poses(
         outlier_s=sum(end - begin for begin, end in outliers),
     )
     outlier = _mark(times - own, outliers)
-    return _correct_poses(poses, own + late, outlier), found
+    return _correct_poses(poses, own + late, outlier), aligned
 
 
 def _mark(times: Floats, spans: Sequence[tuple[float, float]]) -> Flags:
