@@ -112,6 +112,7 @@ else:
                 "Flags",
                 "Floats",
                 "Ints",
+                "RobustFit",
                 "find_scale",
                 "fit_robustly",
                 "group_rows",
@@ -128,7 +129,7 @@ else:
                 "spread_equal",
                 "student_quantile",
                 "turn_units",
-                "weigh",
+                "weigh_bounded",
             ),
             "machine_code": (
                 "LANES",

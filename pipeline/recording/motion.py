@@ -19,11 +19,11 @@ from pipeline.core import (
     Floats,
     Ints,
     find_scale,
+    fit_robustly,
     list_likelihoods,
     recur,
     rigid,
     student_quantile,
-    weigh,
 )
 
 BLOCK_S = 5.0
@@ -46,6 +46,10 @@ _NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta 
 _LEAST_FREEDOM = 0.5
 """Least number of degrees of freedom of a spread: with less, one block has more than five times the weight of
 the other."""
+_LEAST_ERROR = 1e-15
+"""Least standard error, to keep quotients finite."""
+_ROUNDS = 6
+"""Reweightings of a fit."""
 _MOST_ROWS = 3000
 """Number of steps above which the noise is fitted to some of the blocks."""
 
@@ -107,23 +111,6 @@ def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
     return recur(made, np.where(goes_on[:, 0], theta, 0.0))
 
 
-def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:
-    """Gains, residuals and square roots of the weights by reweighted least squares."""
-    gains: Floats = np.zeros(columns.shape[1])
-    weight: Floats = np.ones(values.size)
-    rest: Floats = values
-    for _ in range(rounds):
-        if gains.size:
-            weighted = columns * weight[:, None]
-            normal, right = weighted.T @ weighted, weighted.T @ (values * weight)
-            gains = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0], dtype=np.float64)
-        rest = np.asarray(values - columns @ gains, dtype=np.float64)
-        weight = np.sqrt(weigh(rest))
-        if not gains.size:
-            break
-    return gains, rest, weight
-
-
 def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     """Fit a channel of the motion by columns.
 
@@ -132,7 +119,7 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
         columns: explaining increments, shape (n, k); k may be zero.
         steps: the time steps.
     """
-    _, rest, _ = _solve(values, columns)
+    rest = fit_robustly(columns, values, measure=find_scale, rounds=_ROUNDS).rest
     noise, best = _NOISES[0], -np.inf
     # Whole blocks of a long run show its noise.
     some = steps.block % max(1, rest.size // _MOST_ROWS) == 0
@@ -143,13 +130,12 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
             noise, best = each, score
     white = _whiten(np.column_stack([values, columns]), noise, steps)
     design = white[:, 1:]
-    gains, rest, weight = _solve(white[:, 0], design)
+    made = fit_robustly(design, white[:, 0], measure=find_scale, rounds=_ROUNDS)
+    gains, rest = made.gains, made.rest
     blocks: Floats = np.bincount(steps.block, list_likelihoods(rest)).astype(np.float64)
     if not gains.size:
         return Fit(gains, gains, blocks, blocks)
-    inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))
-    pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
-    error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
+    error = np.maximum(made.find_errors(design, steps.block), _LEAST_ERROR)
     other = list_likelihoods(rest + 2.0 * gains[0] * design[:, 0])
     turned: Floats = np.bincount(steps.block, other).astype(np.float64)
     spread = measure_spread(values - columns[:, 1:] @ gains[1:], columns[:, 0], float(gains[0]), steps)

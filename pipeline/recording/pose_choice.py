@@ -386,7 +386,7 @@ def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None
     size = float(np.sqrt(np.mean(moved**2)))
     if size < STILL_MPS * SPAN_S:
         return None
-    _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
+    rest = fit_robustly(np.column_stack((driven, changed)), moved).rest
     return float(np.median(np.abs(rest))) / size
 
 

@@ -11,18 +11,16 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, robust_spread
+from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, fit_robustly
 from pipeline.recording import ONE_SCALE, SIGNALS, Finding, check_echo, find_steady_gain, interpolate_readings
 from pipeline.run import (
     ANSWERS_S,
-    SPAN_S,
     Alignment,
     DriveSeries,
     GyroFit,
     MotionError,
     Track,
     align_heading,
-    has_excluded,
     mark_excluded,
     name_inputs,
     read_gyro,
@@ -32,7 +30,7 @@ from pipeline.run import (
 )
 from pipeline.sources import Vehicle, VelocitySection
 from pipeline.stages.drive_numbers import mark_late_starts
-from pipeline.stages.gyro import fit_gyro
+from pipeline.stages.gyro import fit_gyro, pair_poses
 from pipeline.stages.inputs import interpolate_wheels, usual_hold
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import LEAST_CORRELATION, estimate_delay
@@ -234,6 +232,8 @@ def correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: Alignment)
 # effect of the catalogue. A deviation of eight times the usual one at that speed, and of a quarter of a
 # metre, is an outlier, up to a twentieth of the run.
 
+_EARLY_S = 1e-3
+"""See `pair_poses`: rounding."""
 _LONGEST_S = 1.2
 """Longest span of a tested displacement [s]: over a longer one the wheels' motion is too uncertain."""
 _FEWEST = 200
@@ -249,8 +249,10 @@ _LARGEST_SHARE = 0.05
 0 to 10 % of the windows of the recordings."""
 _LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
 """Delays [s] at which wheels enter the model: their mixture approximates any lag and inertia up to 1.6 s."""
-_ROUNDS = 10
-"""Reweighting iterations, as in `fit_robustly`."""
+_LEAST_NOISE_M = 1e-3
+"""Least noise of a displacement: a localization that errs less is a simulation."""
+_RIDGE = 1e-4
+"""See `fit_robustly`: at one speed its columns do not determine their coefficients."""
 _BINS = 6
 """Classes of speed of equal size, at least 33 displacements in each."""
 _BESIDE_S = 0.05
@@ -270,7 +272,9 @@ def find_outliers(
         vehicle: geometry.
         excluded: times [s] that are not compared, increasing.
     """
-    first, last = _pair_up(track, excluded)
+    first, last = pair_poses(track, excluded, early_s=_EARLY_S, longest_s=_LONGEST_S)
+    active = track.active[first] & track.active[last]
+    first, last = first[active], last[active]
     if first.size < _FEWEST:
         return []
     off = _measure_misfit(track, heading, at, wheels, vehicle, first, last)
@@ -291,18 +295,6 @@ def _join(begin: Floats, end: Floats) -> Floats:
     until = np.maximum.accumulate(end)
     first = np.append(True, begin[1:] > until[:-1])[: begin.size]
     return np.column_stack((begin[first], until[np.append(first[1:], True)[: begin.size]]))
-
-
-def _pair_up(track: Track, excluded: Floats) -> tuple[Ints, Ints]:
-    """Poses of one segment half a second apart, and those before and after a longer wait."""
-    times = track.times
-    first = np.arange(times.size)
-    last = np.searchsorted(times, times + SPAN_S - 1e-3)
-    mask = last < times.size
-    first, last = first[mask], last[mask].astype(np.int64)
-    mask = (track.segment[first] == track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
-    mask &= track.active[first] & track.active[last] & ~has_excluded(excluded, times[first], times[last])
-    return first[mask], last[mask]
 
 
 def _measure_misfit(
@@ -331,25 +323,10 @@ def _measure_misfit(
         rest += [drive(sideways * turning, 0.1), drive(np.abs(sideways), 0.1)]
         speed = np.hypot(speed, aside[_LAGS_S.index(0.1)])
     columns = np.column_stack((*along, *across, *beside, *rest))
-    gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
-    size = np.hypot(gap[:, 0], gap[:, 1])
+    parts = (moved.real, moved.imag)
+    size = np.hypot(*(fit_robustly(columns, part, least=_LEAST_NOISE_M, ridge=_RIDGE).rest for part in parts))
     usual = _spread_by_speed(size, speed / span)
     return size / np.maximum(_FAR * usual, _LEAST_M)
-
-
-def _fit_robustly(columns: Floats, values: Floats) -> Floats:
-    """Residuals of a regression with Cauchy weights, shape (n,)."""
-    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-9
-    design = columns / scale
-    weight, residual = np.ones(values.size), values
-    ridge = 1e-4 * values.size * np.eye(design.shape[1])
-    for _ in range(_ROUNDS):
-        rows = design * weight[:, None]
-        estimates = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
-        residual = values - design @ estimates
-        spread = max(robust_spread(residual), 1e-3)
-        weight = 1.0 / (1.0 + (residual / (2.0 * spread)) ** 2)
-    return residual
 
 
 def _spread_by_speed(size: Floats, speed: Floats) -> Floats:

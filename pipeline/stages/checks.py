@@ -49,9 +49,9 @@ def check_side_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return []
     sides = {name: side[live] for name, side in sides.items()}
     turned = sides["pose"][:, 1] - sides["pose"][:, 0]
-    (left, right), _ = fit_robustly(sides["wheels"], turned)
-    (left_ratio, _), _ = fit_robustly(sides["command"], sides["wheels"][:, 0])
-    (_, own_right), _ = fit_robustly(sides["command"], sides["wheels"][:, 1])
+    left, right = fit_robustly(sides["wheels"], turned).gains
+    left_ratio = fit_robustly(sides["command"], sides["wheels"][:, 0]).gains[0]
+    own_right = fit_robustly(sides["command"], sides["wheels"][:, 1]).gains[1]
     if not (left < 0.0 < right and left_ratio > 0.0 and own_right > 0.0):
         return []
     of_command, of_body = float(np.log(left_ratio / own_right)), float(np.log(-left / right))

@@ -21,10 +21,10 @@ from pipeline.core import (
     Floats,
     find_runs,
     find_scale,
+    fit_robustly,
     list_likelihoods,
     number_stretches,
     recur,
-    weigh,
 )
 from pipeline.recording import BLOCK_S, LASTS_NATS, Finding, follow_likeliest, price_change
 from pipeline.run import ANSWERS_S, LIVE_SHARE, STILL_MPS
@@ -59,8 +59,6 @@ While the source drives, what a fit does not know lasts, too: there the end cost
 """
 _FEWEST_BLOCKS = 40
 """Least number of blocks for a fit of eighteen coefficients."""
-_ROUNDS = 8
-"""Reweighting iterations."""
 _FEWEST_AT_REST = 8
 """Least number of blocks at rest for the noise at rest: two of them are below their quartile."""
 _QUARTILE = 0.3186
@@ -71,7 +69,7 @@ _LEAST_AT_REST = 0.1 * STILL_MPS
 _FRICTIONS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3)
 """Fractions of the usual largest speed up to which a command may not overcome friction: the likeliest."""
 _TINY = 1e-3
-"""Share of a column's power that is added to it: what a short run does not determine stays small."""
+"""See `fit_robustly`: what a short run does not determine stays small."""
 _SLOW_S = 1.0
 """Time constant of the slowest of the lags that a fit mixes [s]."""
 _COASTS_S = 3.0
@@ -385,29 +383,17 @@ def _fit(
     fits = []
     for friction in _FRICTIONS if is_command else _FRICTIONS[:1]:
         columns = blocks.list_columns(source, top, friction)
-        solved = [_solve(columns[rows], values[:, i], least) for i in range(3)]
-        gains = np.column_stack([one[0] for one in solved])
-        moving = np.hypot([find_scale(one[1]) for one in solved], least)
+        made = [
+            fit_robustly(columns[rows], values[:, i], measure=find_scale, least=least, ridge=_TINY)
+            for i in range(3)
+        ]
+        gains, moving = np.column_stack([one.gains for one in made]), np.array([one.scale for one in made])
         expected = columns @ gains
         # Of what comes to rest as much is unknown as is expected to be left of its motion.
         settling = np.minimum(np.hypot(at_rest, expected), moving)
         scale = np.where(rests[:, None], settling, moving)
         fits.append(_Fit(top, friction, gains, target, expected, scale, spread, is_judged, rests))
     return max(fits, key=lambda one: one.total)
-
-
-def _solve(columns: Floats, values: Floats, least: float) -> tuple[Floats, Floats]:
-    """Coefficients and residuals of a robust regression; below the least difference all fit alike."""
-    size = np.sqrt(np.mean(columns**2, axis=0)) + _TINY
-    design, weight = columns / size, np.ones(values.size)
-    ridge = _TINY * values.size * np.eye(size.size)
-    gains, rest = np.zeros(size.size), values
-    for _ in range(_ROUNDS):
-        weighted = design * weight[:, None]
-        gains = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ values)
-        rest = values - design @ gains
-        weight = weigh(rest, math.hypot(find_scale(rest), least))
-    return gains / size, rest
 
 
 _LONG_PAUSE_S = 2.0

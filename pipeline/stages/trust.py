@@ -236,10 +236,11 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
     """
     if drifted.size < _FEWEST_SPANS:
         return False
-    (half_step,), rest = fit_robustly(swung[:, None], drifted)
+    made = fit_robustly(swung[:, None], drifted)
+    half_step = float(made.gains[0])
     drift = float(np.median(np.abs(half_step * swung)))
     known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
-    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * SPAN_S)
+    regular = float(np.median(np.abs(made.rest))) <= max(_UNEVEN * drift, _SIDEWAYS * SPAN_S)
     return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
@@ -339,9 +340,9 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     design, moved = _arrange(samples, samples.measured, first, last)
     stretch = np.minimum(np.arange(first.size) * _BLOCKS // first.size, _BLOCKS - 1)
-    whole = fit_robustly(design, moved)[0]
+    whole = fit_robustly(design, moved).gains
     others = [stretch != one for one in range(_BLOCKS)]
-    without = np.array([fit_robustly(design[rows], moved[rows])[0] for rows in others])
+    without = np.array([fit_robustly(design[rows], moved[rows]).gains for rows in others])
     pair, pairs = whole[1:3], without[:, 1:3]
     freedom = _BLOCKS - 1.0
     centred = pairs - pairs.mean(axis=0)
