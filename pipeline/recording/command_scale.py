@@ -14,8 +14,7 @@ from pipeline.core import Flags, Floats, SlipError, fit_robustly, pick, robust_s
 from pipeline.recording.case import Case
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
-from pipeline.recording.motion import FEWEST_STEPS
-from pipeline.recording.pose_choice import ONE_SCALE
+from pipeline.recording.motion import FEWEST_STEPS, ONE_SCALE
 from pipeline.recording.readings import Held, Reading
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import DriveForm, Vehicle, list_presets

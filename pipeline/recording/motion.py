@@ -23,8 +23,10 @@ from pipeline.core import (
     list_likelihoods,
     recur,
     rigid,
+    robust_spread,
     student_quantile,
 )
+from pipeline.run import LIVE_SHARE
 
 BLOCK_S = 5.0
 """Length of a block [s], longer than any correlation of the noise that is modelled."""
@@ -34,6 +36,9 @@ LEAST_NATS = 0.02
 """Least gain in log-likelihood per step of a decision: below it a difference is of no importance."""
 FEWEST_STEPS = 30
 """Least number of steps for a likelihood."""
+ONE_SCALE = 0.2
+"""Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
+not."""
 DRIVEN_S = 10.0
 """Driving [s] in one of the blocks that the first gain of a fit is compared between: time enough for starts,
 stops and turns, so that what differs is not the manoeuvre alone."""
@@ -176,6 +181,23 @@ def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) ->
 def measure_share(values: Floats, model: Floats) -> float:
     """Part of the size of some increments that a model explains, outliers discounted, from 0 to 1."""
     return 1.0 - min(1.0, (find_scale(values - model) / find_scale(values)) ** 2)
+
+
+def find_one_ratio(moved: Floats, driven: Floats, fewest: int) -> float | None:
+    """Median of one speed over another; None if the ratio is not constant.
+
+    Args:
+        moved: shape (n,); NaN where unknown.
+        driven: in the same order, which counts where it is well above that of standing.
+        fewest: least number of samples that count.
+    """
+    size = np.where(np.isfinite(moved), np.nan_to_num(np.abs(driven)), 0.0)
+    live = size > LIVE_SHARE * float(np.max(size, initial=0.0))
+    if live.sum() < fewest:
+        return None
+    ratio = moved[live] / driven[live]
+    middle = float(np.median(ratio))
+    return middle if robust_spread(ratio - middle) <= ONE_SCALE * abs(middle) else None
 
 
 def compare(one: Floats, other: Floats) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, fit_robustly
-from pipeline.recording import ONE_SCALE, SIGNALS, Finding, check_echo, find_steady_gain, interpolate_readings
+from pipeline.recording import ONE_SCALE, SIGNALS, Finding, check_echo, find_one_ratio, interpolate_readings
 from pipeline.run import (
     ANSWERS_S,
     Alignment,
@@ -36,6 +36,8 @@ from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import LEAST_CORRELATION, estimate_delay
 from pipeline.stages.velocity import smooth_gyro
 
+_FEWEST_ASKED = 20
+"""Least number of stretches of a command for the controller's multiplier."""
 _LEAST_S = 0.05
 """Least delay of encoders [s] that is corrected here; fits find shorter ones (six of twelve recordings)."""
 
@@ -191,7 +193,8 @@ def measure_body_multiplier(commands: pl.DataFrame, vehicle: Vehicle) -> float |
 
     def compare(name: str, wheels: Floats) -> float | None:
         asked = live[name].to_numpy()
-        return find_steady_gain(np.bincount(number, wheels) / count, np.bincount(number, asked) / count)
+        sums = np.bincount(number, wheels), np.bincount(number, asked)
+        return find_one_ratio(sums[0] / count, sums[1] / count, _FEWEST_ASKED)
 
     ahead, turned = compare("body_x", rolled[0]), compare("body_w", rolled[2])
     is_other = ahead is not None and abs(ahead - 1.0) > ONE_SCALE

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, Ints, fit_robustly, robust_spread
-from pipeline.recording import ONE_SCALE, SURE, Finding
-from pipeline.run import LIVE_SHARE, STILL_MPS
+from pipeline.core import Floats, Ints, fit_robustly
+from pipeline.recording import SURE, Finding, find_one_ratio
+from pipeline.run import STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages.slip_stage import SlipResult
 from pipeline.stages.trust import (
@@ -92,13 +92,13 @@ _SPEED_TOLERANCE: Final = 0.05
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """Check the steady gain from the measured wheels to the forward motion."""
     moved, steady = samples.velocity[:, 0], samples.steady
-    gain = None if samples.measured is None else find_gain(samples.measured[:, 0], moved, steady)
+    gain = None if samples.measured is None else _find_gain(samples.measured[steady, 0], moved[steady])
     if gain is None or samples.measured is None:
         return []
     if _LEAST < gain < _MOST:
         reached = None
         if samples.body_commanded and samples.command is not None:
-            reached = find_gain(samples.command[:, 0], moved, steady)
+            reached = _find_gain(samples.command[steady, 0], moved[steady])
         if reached is None or abs(reached - 1.0) > _SPEED_TOLERANCE or abs(gain - 1.0) < _LEAST_DIFFERENCE:
             return []
     driven = samples.measured[:, 0]
@@ -123,29 +123,17 @@ def is_grip(gain: float, others: Iterable[float]) -> bool:
 
 
 def find_gain_of(slip: pl.DataFrame) -> float | None:
-    """`find_gain` of the measured wheels of a run, from the rows of its table `slip`."""
-    rows = slip.filter(pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"))
-    return find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy(), ~rows["transitory"].to_numpy())
+    """The steady gain from the measured wheels to the forward motion, from the rows of table `slip`."""
+    rows = slip.filter(
+        pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"), ~pl.col("transitory")
+    )
+    return _find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy())
 
 
-def find_gain(driven: Floats, moved: Floats, steady: Flags) -> float | None:
-    """Median of the forward motion over an ideal one; None if it is not steady.
-
-    Args:
-        driven: ideal forward speed [m/s], shape (n,).
-        moved: measured forward speed [m/s], shape (n,).
-        steady: samples without a change of command, shape (n,).
-    """
-    known = np.isfinite(driven) & np.isfinite(moved) & steady
-    if known.sum() < FEWEST_SAMPLES:
-        return None
-    live = known & (np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven[known]))))
-    if live.sum() < FEWEST_SAMPLES:
-        return None
-    ratio = moved[live] / driven[live]
-    gain = float(np.median(ratio))
-    spread = robust_spread(ratio - gain)
-    return gain if gain > 0.0 and spread <= ONE_SCALE * gain else None
+def _find_gain(driven: Floats, moved: Floats) -> float | None:
+    """Median of the forward motion over an ideal one; None if it is not steady, or backward."""
+    gain = find_one_ratio(moved, driven, FEWEST_SAMPLES)
+    return gain if gain is not None and gain > 0.0 else None
 
 
 # Checks of a whole run: whether the vehicle moves at all, and whether encoders, command and pose agree.
