@@ -7,14 +7,13 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Floats, Ints, fit_robustly
+from pipeline.core import Floats, fit_robustly
 from pipeline.recording import SURE, Finding, find_one_ratio
 from pipeline.run import STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages.slip_stage import SlipResult
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
-    LEAST_CORRELATION,
     Samples,
     check_independence,
     check_live_commands,
@@ -300,30 +299,19 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
 
 def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     """Report a heading that is later than the position."""
-    ideal = samples.measured if samples.measured is not None else samples.command
+    ideal = samples.measured
     if ideal is None:
         return []
-    findings = []
     known = np.isfinite(ideal).all(axis=1)
-    places = np.flatnonzero(known)
-    along = _delay_of(samples.velocity[:, 0], ideal[:, 0], places, samples)
-    turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], places, samples)
-    if along is not None and turning is not None and samples.measured is not None:
-        skew = turning[0] - along[0]
-        if abs(skew) > max(_SKEW, SURE * float(np.hypot(along[1], turning[1]))):
-            from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
+    times = samples.times[known]
+    along, turning = (
+        estimate_delay(times, samples.velocity[known, axis], times, ideal[known, axis]) for axis in (0, 2)
+    )
+    if along is None or turning is None:
+        return []
+    skew = turning.seconds - along.seconds
+    if abs(skew) <= max(_SKEW, SURE * float(np.hypot(along.deviation, turning.deviation))):
+        return []
+    from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
 
-            name = find_late_effect(Late.HEADING).id
-            findings.append(Finding(name, "warning", "pose", {"value": skew}))
-    return findings
-
-
-def _delay_of(
-    signal: Floats, reference: Floats, places: Ints, samples: Samples
-) -> tuple[float, float] | None:
-    """Delay and standard deviation [s] of a signal against a reference; None if they do not correlate."""
-    times = samples.times[places]
-    delay = estimate_delay(times, signal[places], times, reference[places])
-    if delay is None or abs(delay.correlation) < LEAST_CORRELATION:
-        return None
-    return delay.seconds, delay.deviation
+    return [Finding(find_late_effect(Late.HEADING).id, "warning", "pose", {"value": skew})]

@@ -33,7 +33,7 @@ from pipeline.stages.inputs import Ideal
 
 Kind = Literal[
     "emergency_stop", "side_stopped", "manual_driving", "pushed", "commands_silent", "stuck",
-    "localization_frozen", "rotated", "lost",
+    "localization_frozen", "rotated", "lost", "outlier",
 ]  # fmt: skip
 
 _INCIDENTS = {
@@ -82,12 +82,18 @@ USUAL_S = 300.0
 
 
 class Span(NamedTuple):
-    """Kind of a contradiction, its start and its end [s], and its gain in log-likelihood."""
+    """A contradiction of poses, wheels and commands.
+
+    Attributes:
+        kind: of it.
+        start, end: [s].
+        value: its gain in log-likelihood; of an outlier its size over the least one.
+    """
 
     kind: Kind
     start: float
     end: float
-    nats: float
+    value: float
 
 
 @dataclass(frozen=True)
@@ -151,12 +157,17 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
     return Rims(times, asked, known, expired, driven, moved, top)
 
 
-def mark_excluded(times: Floats, incidents: Sequence[Span]) -> Flags:
+def mark_spans(times: Floats, spans: Sequence[Span], *, before_s: float = 0.0, after_s: float = 0.0) -> Flags:
+    """Times in some spans, or up to some time before or after one, shape (n,)."""
+    inside = np.zeros(times.size, dtype=bool)
+    for one in spans:
+        inside |= (times >= one.start - before_s) & (times <= one.end + after_s)
+    return inside
+
+
+def mark_incidents(times: Floats, incidents: Sequence[Span]) -> Flags:
     """Samples that incidents exclude, shape (n,)."""
-    excluded = np.zeros(times.size, dtype=bool)
-    for one in incidents:
-        excluded |= (times >= one.start - _MARGIN_S) & (times <= one.end + _COASTS_S)
-    return excluded
+    return mark_spans(times, incidents, before_s=_MARGIN_S, after_s=_COASTS_S)
 
 
 def find_spans(
@@ -187,9 +198,7 @@ def find_spans(
     spans.sort(key=lambda one: one.start)
     incidents = tuple(one for one in spans if one.kind in _INCIDENTS)
     bad = [one for one in spans if one.kind not in _INCIDENTS]
-    wrong = np.zeros(times.size, dtype=bool)
-    for one in bad:
-        wrong |= (times >= one.start) & (times <= one.end)
+    wrong = mark_spans(times, bad)
     if bad:
         findings.append(_report_poses(bad, wrong, rims))
     about = {"commands_silent": "command", "localization_frozen": "pose"}
@@ -204,7 +213,7 @@ def find_spans(
         )
         for one in incidents
     ]
-    return Spans(wrong, mark_excluded(times, incidents), tuple(findings), incidents)
+    return Spans(wrong, mark_incidents(times, incidents), tuple(findings), incidents)
 
 
 def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:

@@ -24,7 +24,7 @@ _FEWEST_OF_DELAY = 50
 FEWEST_SAMPLES = 100
 """Least number of grid samples for any check: five seconds at 20 Hz. Half and double change no finding of
 two recordings."""
-LEAST_CORRELATION = 0.7
+_LEAST_CORRELATION = 0.7
 """Correlation below which a lag is meaningless: at this value the signals share half of their power."""
 
 
@@ -57,7 +57,7 @@ def estimate_delay(
         largest: largest lag tried, in both directions [s].
 
     Returns:
-        The delay; None if either signal is constant or there are fewer than `_FEWEST_OF_DELAY` samples.
+        The delay; None if the signals do not correlate, or there are fewer than `_FEWEST_OF_DELAY` samples.
     """
     if min(times.size, reference_times.size) < _FEWEST_OF_DELAY:
         return None
@@ -70,6 +70,8 @@ def estimate_delay(
         [_correlate(centred, spread, np.interp(times - lag, reference_times, reference)) for lag in lags]
     )
     best = int(np.argmax(np.abs(scores)))
+    if abs(scores[best]) < _LEAST_CORRELATION:
+        return None
     sign = np.sign(scores[best]) or 1.0
     tall = sign * scores
     if 0 < best < lags.size - 1:
