@@ -354,21 +354,21 @@ def fit_robustly(
 
     Source: Holland and Welsch, Robust regression using iteratively reweighted least-squares, 1977.
     """
-    weights, gains, rest, scale = np.ones(values.size), np.zeros(design.shape[1]), values, 0.0
-    columns, target = design, values
+    size = np.sqrt(np.mean(design**2, axis=0)) + ridge
+    size[size == 0.0] = 1.0
+    scaled = design / size
+    columns, target = scaled, values
+    weights, gains, rest, scale = np.ones(values.size), np.zeros(size.size), values, 0.0
     for _ in range(rounds):
         if group is not None:
-            columns, target = _centre(design, group, weights), _centre(values[:, None], group, weights)[:, 0]
-        size = np.sqrt(np.mean(columns**2, axis=0)) + ridge
-        size[size == 0.0] = 1.0
-        scaled = columns / size
-        weighted = scaled * weights[:, None]
-        normal = weighted.T @ scaled + ridge * values.size * np.eye(size.size)
-        gains = np.asarray(np.linalg.lstsq(normal, weighted.T @ target, rcond=_RANK)[0] / size)
+            columns, target = _centre(scaled, group, weights), _centre(values[:, None], group, weights)[:, 0]
+        weighted = columns * weights[:, None]
+        normal = weighted.T @ columns + ridge * values.size * np.eye(size.size)
+        gains = np.asarray(np.linalg.lstsq(normal, weighted.T @ target, rcond=_RANK)[0], dtype=np.float64)
         rest = target - columns @ gains
         scale = max(math.hypot(measure(rest), least), _LEAST)
         weights = weigh(rest, scale)
-    return RobustFit(gains, rest, weights, scale)
+    return RobustFit(gains / size, rest, weights, scale)
 
 
 def _centre(columns: Floats, group: Ints, weights: Floats) -> Floats:
