@@ -113,6 +113,7 @@ else:
                 "Flags",
                 "Floats",
                 "Ints",
+                "RobustFit",
                 "find_scale",
                 "fit_robustly",
                 "group_rows",
@@ -129,7 +130,7 @@ else:
                 "spread_equal",
                 "student_quantile",
                 "turn_units",
-                "weigh",
+                "weigh_bounded",
             ),
             "machine_code": (
                 "LANES",

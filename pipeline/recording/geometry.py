@@ -178,7 +178,7 @@ def explain_followed(reading: Reading, made: Explained) -> Explained:
     for _ in range(3):
         if followed.sum() < FEWEST_STEPS:
             return made
-        gains = np.column_stack([fit_robustly(columns[followed], side[followed])[0] for side in sides.T])
+        gains = np.column_stack([fit_robustly(columns[followed], side[followed]).gains for side in sides.T])
         limited = (np.abs(columns @ gains) > _OVER * top).any(axis=1)
         last = np.maximum.accumulate(np.where(limited, steps.end, -np.inf))
         followed = steps.start > last + _AFTER_S
