@@ -553,9 +553,7 @@ def _compare(chosen: Choice, given: Given) -> Choice:
         if best is not None and useless:
             bare = replace(bare, pose=None)
             alone = _let_wheels_stand_in(replace(chosen, sources=bare), replace(given, sources=bare))
-            # Speeds that are differences of late positions say little of the wheels.
-            least = _STEADY if best.same_as else -math.inf
-            if alone.recording is not None and alone.recording.margin > least:
+            if alone.recording is not None and (alone.recording.is_followed or not best.same_as):
                 what = f"the poses of {best.source}: {useless}"
                 unused = Finding("numbers_not_used", "warning", best.source.topic, {"what": what})
                 return replace(alone, findings=(*alone.findings, unused))
@@ -606,8 +604,6 @@ def _do_without_pose(chosen: Choice, given: Given, refused: Finding) -> Choice:
     return replace(noted, findings=(*noted.findings, error))
 
 
-_STEADY = 5.0
-"""Vuong's statistic of an odometry's speeds with the commands from which on they stand in for its poses."""
 _ASTRAY = 0.2
 """Share of a pose's path that the wheels do not explain, from which on it may be that of another body."""
 

@@ -1181,6 +1181,8 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "command_timeout": {"held": _command_timeout, "in bursts": _commands_in_bursts},
     "command_delay": _command_delay,
     "command_late": _command_late,
+    "speeds_of_positions": "its speeds are differences of its positions, and scatter as the times between "
+    "its messages do: they are taken over two of its readings",
     "wheels_unsigned": "not used: {wheels}: its speeds have no sign: they are never below zero, though the "
     "body is driven forward and backward",
     "not_driven": {
