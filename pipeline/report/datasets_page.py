@@ -29,10 +29,11 @@ from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axi
 from pipeline.store import Store
 from pipeline.words import (
     Table,
+    describe_terrains,
     list_check_sentences,
-    list_compared,
     list_series,
     list_shown_notes,
+    list_sides,
     name_series,
     tabulate_answer,
     tabulate_causes,
@@ -356,17 +357,13 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
 
 def render_check(check: RunsCheck) -> str:
     """The page of `slip check`."""
-    sides = check.sides
-    both = [
-        f"{format_count(len(runs), 'run')} {side}"
-        for side, runs in (("before", sides.before), ("after", sides.after))
-    ]
-    limits = tabulate_limits(check)
+    sides, limits = list_sides(check), tabulate_limits(check)
     return _build_page(
         "What changed between two drives",
-        both,
+        [f"{format_count(len(sides.get(side, ())), 'run')} {side}" for side in ("before", "after")],
         lines=list_check_sentences(check),
         answer=limits if limits.rows else None,
         tables=[tabulate_check(check)],
-        notes=[*sides.notes, *(f"{label} {text}" for label, text in list_compared(check))],
+        notes=[*check.sides.notes, *filter(None, [describe_terrains(check)])],
+        runs=[f"{run} ({label})" for label, runs in sides.items() for run in runs],
     ).render()
