@@ -213,7 +213,6 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "bracket_unit": bracket_unit,
         "capital": begin_large,
         "squares": set_squares,
         "split_literals": _LITERAL.split,

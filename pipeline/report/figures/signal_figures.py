@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, Floats, suffix_unit
-from pipeline.report import figures, set_squares
+from pipeline.report import figures, set_squares, theme
 from pipeline.report.figures import Figure
 from pipeline.report.theme import Chart, Drawing, layer, make_axis, stack
 from schemas import contract_of
@@ -173,7 +173,11 @@ def draw_signals(scene: Scene) -> Drawing | None:
         words.append(f"{name} of {label}")
         y = make_axis("value", None, scale={"zero": False}, tickCount=4, minExtent=figures.GUTTER - 10)
         x = figures.time_axis(scene, has_title=number == len(chosen) - 1)
-        line = Chart.of_rows(f"signal_{number}").mark("line", clip=True, order=False).encode(x=x, y=y)
+        line = (
+            Chart.of_rows(f"signal_{number}")
+            .mark("line", color=theme.MEASURED, clip=True, order=False)
+            .encode(x=x, y=y)
+        )
         marked = figures.shade_spans(figures.MARKED_SPANS)
         panels.append(layer(*marked, line).properties(width=figures.WIDTH, height=150))
     rows[figures.MARKED_SPANS] = figures.EMPTY_SPANS
