@@ -118,11 +118,11 @@ def tabulate_datasets(answer: Answer, source: str) -> Table:
     rows = []
     for row in sorted(frame.iter_rows(named=True), key=lambda row: order.index(row["dataset"])):
         own = [levels[quantity].get(row["dataset"], {}) for quantity in quantities]
-        cells = [text for one in own for text in (_format_cell(one.get("value")), _format_ends(one))]
+        texts = [text for one in own for text in (_format_cell(one.get("value")), _format_ends(one))]
         driven = [_format_cell(row[name], 0) for name in ("distance", "duration", "samples")]
         norm = _format_cell(row["median_window_norm"])
         rows.append(
-            [str(row["dataset"]), str(row["runs"]), *cells, own[0].get("interval", ""), norm, *driven]
+            [str(row["dataset"]), str(row["runs"]), *texts, own[0].get("interval", ""), norm, *driven]
         )
     caption = f"Datasets: {answer.measure} {INPUT_WORDS[source]}"
     return Table(caption, columns, rows).drop_empty()

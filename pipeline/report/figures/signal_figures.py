@@ -85,13 +85,13 @@ def _encode(numbers: NDArray[np.integer]) -> str:
 def list_signals(scene: Scene) -> list[Signals]:
     """All numbers with a unit in the tables over time that vary, thinned so that a page stays small."""
     tables = {label: (name, frame) for name in _TABLES for label, frame in _split(scene, name)}
-    found = {label: list(_pick_columns(name, frame)) for label, (name, frame) in tables.items()}
-    most = min(_MOST_ROWS, _MOST_POINTS // max(sum(map(len, found.values())), 1))
+    varying = {label: list(_pick_columns(name, frame)) for label, (name, frame) in tables.items()}
+    most = min(_MOST_ROWS, _MOST_POINTS // max(sum(map(len, varying.values())), 1))
     made = []
     for label, (name, frame) in tables.items():
         t = frame["t"].to_numpy()
         size = 1 if t.size <= most else -(-2 * t.size // most)
-        about = {column: contract_of(name).metadata_of(column) for column in found[label]}
+        about = {column: contract_of(name).metadata_of(column) for column in varying[label]}
         made.append(
             Signals(
                 label,
