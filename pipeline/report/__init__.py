@@ -102,8 +102,8 @@ def set_squares(text: str) -> str:
 
 
 def set_numbers(text: str) -> str:
-    """Numbers of a table's cell as a page sets them: with a minus, or a dash where unknown."""
-    return MISSING if text == NOTHING else _MINUS.sub("\u2212", text)
+    """Numbers of a text as a page sets them: with a minus, an arrow, or a dash where unknown."""
+    return MISSING if text == NOTHING else _MINUS.sub("\u2212", text).replace(" -> ", " \u2192 ")
 
 
 def bracket_unit(unit: str) -> str:
@@ -213,7 +213,6 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "bracket_unit": bracket_unit,
         "capital": begin_large,
         "squares": set_squares,
         "split_literals": _LITERAL.split,

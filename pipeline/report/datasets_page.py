@@ -29,10 +29,11 @@ from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axi
 from pipeline.store import Store
 from pipeline.words import (
     Table,
+    describe_terrains,
     list_check_sentences,
-    list_compared,
     list_series,
     list_shown_notes,
+    list_sides,
     name_series,
     tabulate_answer,
     tabulate_causes,
@@ -338,35 +339,41 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
         .mark("point", size=170, filled=True, opacity=1)
         .encode(
             **axes,
-            color=encode_column("value:Q", scale={"range": list(theme.SLIP_RAMP)}, legend={"title": about}),
+            color=encode_column(
+                "value:Q",
+                scale={"range": list(theme.SLIP_RAMP), "interpolate": "rgb"},
+                legend={"title": about},
+            ),
             tooltip=["dataset:N", "runs:Q", "energy:Q", "value:Q"],
         )
     )
-    names = Chart.of_rows("own").mark("text", align="left", dx=12, fontWeight=600).encode(
-        **axes, text="dataset:N"
-    )  # fmt: skip
+    # Of datasets with nearly the same energy one name stands above its mark and the other below.
+    names = [
+        Chart.of_rows("own")
+        .filter(f"datum.side === {side}")
+        .mark("text", align="left", dx=9, dy=dy, fontWeight=600)
+        .encode(**axes, text="dataset:N")
+        for side, dy in ((0, -11), (1, 13))
+    ]
     # Scales of no rows have no ends.
-    own = (marks, names) if drawn.own.height else ()
+    own = (marks, *names) if drawn.own.height else ()
     chart = layer(literature, *own).properties(width=720, height=520)
     note = "Hollow: mass, speed or terrain is not known well. Point at a mark to read what it is."
     words = f"{drawn.points.height} deployments of the literature and {drawn.own.height} own datasets."
-    rows = {"literature": drawn.points, "own": drawn.own}
+    sides = drawn.own.with_columns(side=pl.col("energy").rank("ordinal") % 2)
+    rows = {"literature": drawn.points, "own": sides}
     return Picture("deployment_map", "Energy and terrain", Drawing(chart, rows, note, words))
 
 
 def render_check(check: RunsCheck) -> str:
     """The page of `slip check`."""
-    sides = check.sides
-    both = [
-        f"{format_count(len(runs), 'run')} {side}"
-        for side, runs in (("before", sides.before), ("after", sides.after))
-    ]
-    limits = tabulate_limits(check)
+    sides, limits = list_sides(check), tabulate_limits(check)
     return _build_page(
         "What changed between two drives",
-        both,
+        [f"{format_count(len(sides.get(side, ())), 'run')} {side}" for side in ("before", "after")],
         lines=list_check_sentences(check),
         answer=limits if limits.rows else None,
         tables=[tabulate_check(check)],
-        notes=[*sides.notes, *(f"{label} {text}" for label, text in list_compared(check))],
+        notes=[*check.sides.notes, *filter(None, [describe_terrains(check)])],
+        runs=[f"{run} ({label})" for label, runs in sides.items() for run in runs],
     ).render()

@@ -27,11 +27,12 @@ else:
         {
             "check": (
                 "check_as_json",
+                "describe_terrains",
                 "format_junit",
                 "format_markdown",
                 "list_check_lines",
                 "list_check_sentences",
-                "list_compared",
+                "list_sides",
                 "tabulate_check",
                 "tabulate_limits",
             ),

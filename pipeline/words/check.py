@@ -20,8 +20,8 @@ Line = tuple[str, str]
 _MOST = 3
 """Numbers in a sentence; the table lists all."""
 _HEAD = (
-    Column("result", wide=True),
     Column("number"),
+    Column("result", wide=True),
     Column("before -> after"),
     Column("difference [95 %]"),
     Column("runs differ"),
@@ -115,7 +115,7 @@ def tabulate_check(check: RunsCheck) -> Table:
         before, after = _format(one, one.before), _format(one, one.after)
         before = before.removesuffix(f" {after.partition(' ')[2]}")
         status = Cell(one.status, strong=one.status == "changed")
-        rows.append([status, one.title, f"{before} -> {after}", difference, spread])
+        rows.append([one.title, status, f"{before} -> {after}", difference, spread])
     note = "" if check.is_spread_known else "intervals: of these recordings alone"
     return Table("Numbers before and after", _HEAD, rows, note)
 
@@ -129,19 +129,19 @@ def tabulate_limits(check: RunsCheck) -> Table:
     return Table("Limits", (Column("limit"), Column("measured"), Column("outcome")), rows)
 
 
-def list_compared(check: RunsCheck) -> list[Line]:
-    """The runs of both sides and those that tell how much runs differ, and on which terrains they were."""
+def list_sides(check: RunsCheck) -> dict[str, list[str]]:
+    """Names of the runs of both sides, and of those that tell how much runs differ."""
     sides = check.sides
     others = [one for runs in sides.others.values() for one in runs]
-    lines = [
-        (label, f"{len(runs)}: {', '.join(one.run for one in runs)}")
-        for label, runs in (("before", sides.before), ("after", sides.after), ("others", others))
-        if runs
-    ]
-    before, after = (" and ".join(one) for one in sides.terrains)
-    if before and after and before != after:
-        lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
-    return lines
+    groups = {"before": sides.before, "after": sides.after, "others": others}
+    return {label: [one.run for one in runs] for label, runs in groups.items() if runs}
+
+
+def describe_terrains(check: RunsCheck) -> str:
+    """That both sides were driven on different terrains; empty if they were not."""
+    before, after = (" and ".join(one) for one in check.sides.terrains)
+    is_known = before and after and before != after
+    return f"BEFORE was driven on {before}, AFTER on {after}" if is_known else ""
 
 
 def list_check_lines(check: RunsCheck) -> list[Line]:
@@ -149,10 +149,12 @@ def list_check_lines(check: RunsCheck) -> list[Line]:
     lines = [("verdict", format_check(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     table = tabulate_check(check)
-    labels = ["", *(str(row[0]) for row in table.rows)]
+    labels = ["", *(one.status for one in check.numbers)]
     lines += zip(labels, table.align(), strict=False)
     lines += [("", table.note)] if table.note else []
-    return [*lines, *list_compared(check), *(("note", note) for note in check.sides.notes)]
+    lines += [(label, f"{len(runs)}: {', '.join(runs)}") for label, runs in list_sides(check).items()]
+    lines += [("terrains", text)] if (text := describe_terrains(check)) else []
+    return lines + [("note", note) for note in check.sides.notes]
 
 
 def format_markdown(check: RunsCheck) -> str:

@@ -96,7 +96,7 @@ def test_the_page_of_a_check_is_a_file_that_shows_the_table_of_the_screen(place:
     text = html.unescape(re.sub(r"<[^>]+>", " ", page))
     (row,) = (line for line in screen.splitlines() if line.startswith("changed"))
     for cell in re.split(r" {2,}", row):
-        assert cell.replace("-> ", "") in text.replace("-> ", ""), cell
+        assert cell.replace("->", "\u2192") in text, cell
     assert page.startswith("<!DOCTYPE html>")
     assert "script-src 'none'" in page
     assert (place / "logs/late.mcap").stem in text, "the compared runs are named"

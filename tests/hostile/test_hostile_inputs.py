@@ -115,7 +115,7 @@ WORDS: list[tuple[str, str]] = [
     ("check field/wide husky.toml", "husky.toml: AFTER is a model file, and not what was driven"),
     ("check '' field/wide", "the check has no runs BEFORE"),
     ("check husky.toml ''", "the check has no runs AFTER"),
-    ("check husky.toml field/wide --file check.md", "Add --to markdown or --to junit"),
+    ("check husky.toml field/wide --file check.md", "Add --to markdown, junit or html"),
     ("check folder folder", "there is no recording in it. Recordings are files that end in .mcap"),
     ("compare text.mcap", "this is not a results folder. Give the folder"),
     ("compare folder", "this is not a results folder. Give the folder"),
