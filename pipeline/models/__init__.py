@@ -98,6 +98,7 @@ else:
                 "DOUBTS",
                 "Interval",
                 "Number",
+                "expect_another_run",
                 "split_determined",
             ),
             "parameter": (
