@@ -67,6 +67,8 @@ else:
                 "ALIKE",
                 "DIFFERENT",
                 "OF_TWO_RUNS",
+                "OTHERS_SPREAD",
+                "OVER_RUNS",
                 "THIS_RUN",
                 "UNTESTED",
                 "judge_pair",

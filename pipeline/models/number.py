@@ -29,7 +29,7 @@ DOUBTS = {
     ONE_LIMIT: ("undetermined", "undetermined: its interval reaches a limit of the search"),
     UNDECIDED: ("undecided", "undecided: another effect would explain the data as well"),
     TOO_SHORT: ("run too short", "the driving is too short for certainty"),
-    FEW_STRETCHES: ("read from {} stretches", "read from {} of the driven stretches of 20 s only"),
+    FEW_STRETCHES: ("few stretches: {}", "only {} of the driven stretches of 20 s tell it"),
 }
 """Of each doubt about a number: its mark beside a value, and the reason."""
 

@@ -79,7 +79,6 @@ else:
                 "format_fleet",
                 "format_map",
                 "format_trend",
-                "list_series",
                 "name_series",
                 "summarize_map",
                 "tabulate_fleet",
