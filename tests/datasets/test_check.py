@@ -174,7 +174,7 @@ def test_what_is_unknown_says_on_which_side_and_why(late: Sides) -> None:
         after=tuple(hide(one, POSITION_ERROR, LAG) for one in late.after),
     )
     rows = " ".join(text for label, text in list_check_lines(compare_sides(blind)) if label == "unknown")
-    assert "unknown before and after: fewer than 3 stretches of 20 s" in rows
+    assert "unknown before and after: fewer than 3 stretches of 10 s" in rows
     assert "unknown after: the runs do not determine it" in rows
 
 

@@ -61,8 +61,8 @@ def test_a_track_that_moved_is_told_with_its_day(tmp_path: Path) -> None:
     assert "1.8 -&gt; 2.1 since 2026-05-03" in page
     # Page, screen and JSON have the same series.
     assert f"{len(content['series'])} series" in page
-    tested = sum(one["step"] is not None for one in content["series"])
-    assert f"1 significant step in {tested} of {len(content['series'])} series that could be tested" in page
+    assert all(one["step"]["is_significant"] for one in content["series"])
+    assert "3 significant steps in 3 of 3 series that could be tested" in page
 
 
 def test_a_step_is_found_across_grounds_and_another_ground_is_none() -> None:
