@@ -260,9 +260,12 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     fit = _fit(rows)
     pooled = fit.pool()
     level, because = decide_level(fit, pooled, number)
-    apart = () if level in {Level.TERRAIN, Level.RUN} and number.level is None else _find_apart(rows, number)
+    # Of what is the ground's or the run's own, values may differ.
+    apart = [] if level in {Level.TERRAIN, Level.RUN} else _find_apart(rows, number)
     if apart:
-        level, because = None, f"runs disagree by more than {number.spread.size:.2g}: {', '.join(apart)}"
+        because = f"; {because}" if level is None else ""
+        because = f"runs disagree by more than {number.spread.size:.2g}: {', '.join(apart)}{because}"
+        level = None
     # A pose clock that gyros determine was corrected before the fit: it has no other name.
     dated = kind.late is Late.POSES and not rows["in_model"].any()
     readings = {} if dated else {reading.level: reading.name for reading in kind.readings}
@@ -304,13 +307,9 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
 
 
 def _find_apart(rows: pl.DataFrame, number: Parameter) -> list[str]:
-    """Runs with their values, ascending, if they differ by more than errors and the usual spread explain.
-
-    Of what is a property of the ground those of one ground are compared.
-    """
-    grounds = rows["terrain"].to_list() if number.level is Level.TERRAIN else ["*"] * rows.height
+    """Runs with their values, ascending, if they differ by more than errors and the usual spread explain."""
     errors = rows["standard_error"].to_numpy() ** 2 + number.spread.size**2
-    fit = fit_levels(rows["value"].to_numpy(), grounds, errors, fewest=1)
+    fit = fit_levels(rows["value"].to_numpy(), ["*"] * rows.height, errors, fewest=1)
     if not fit.p_spread < SURE:
         return []
     return [f"{run} {value:.3g}" for run, value in rows.select("run", "value").sort("value").iter_rows()]

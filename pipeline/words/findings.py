@@ -684,8 +684,8 @@ _LENGTHS = {"wheel_radius_m": "a wheel radius", "track_width_m": "a track", "whe
 def _wheels_alone(of: Values) -> str:
     taken = " and ".join(f"{_LENGTHS[key]} of {value:g} m" for key, value in of["assumed"].items())
     return (
-        "no vehicle is given: commands and measurements are of the same wheels, which shares of slip do "
-        f"without; lengths in metres are for {taken} ([vehicle] {', '.join(of['assumed'])} in run.toml: others)"
+        "no vehicle is given: commands and measurements are of the same wheels, and shares of slip need "
+        f"none; lengths in metres are for {taken} ([vehicle] {', '.join(of['assumed'])} in run.toml: others)"
     )
 
 
