@@ -24,6 +24,7 @@ from pipeline.models import (
     Model,
     Number,
     expect_another_run,
+    find_late,
     is_of_one_run,
     list_effects,
 )
@@ -216,7 +217,8 @@ def list_by_run(
     """Values of an effect: by run where runs or grounds have their own, else once."""
     if was_aligned(effect, data):
         delays = [run.alignment.heading_delay_s for run in data.runs]
-        beyond = effect.delay - float(np.mean(delays))
+        skew = None if assessment is None else find_late(assessment.fitted.model, Late.HEADING)
+        beyond = effect.delay - float(np.mean(delays)) if skew is None else -skew.delay
         return tuple(
             read_clock(effect.of_delay(beyond + delay), run)
             for delay, run in zip(delays, data.runs, strict=True)

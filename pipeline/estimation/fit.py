@@ -31,6 +31,8 @@ _SETTLED = 1e-8
 """The same for a model that is written: six digits of its numbers are the same from every start."""
 _ASTRAY = 100.0
 """Expected fall over the least so far, above which steps lead nowhere."""
+_FLATTER, _LONGEST = 1.5, 64.0
+"""Fall over that which a step promises, from which it is doubled, and the longest in steps."""
 _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
 _CONVERGING = 0.3
@@ -348,9 +350,7 @@ def _descend(fit: PathFit, *, rough: int = 0, target: float = math.inf) -> PathF
             break
         fall = 0.0
         if expected_fall >= _ENOUGH and (is_fresh or expected_fall < _CONVERGING * before):
-            state = fit.state.move(moving, step)
-            residual = path.find_residuals(state)
-            fall = cost - measure_cost(path, fit.noise, state, free, residual)
+            state, residual, fall = _try_step(fit, moving, step, cost, expected_fall)
         if fall > 0.0:
             fit, cost, fallen = replace(fit, state=state, residual=residual), cost - fall, fallen + fall
             damping = max(damping / 30.0, 1e-9)
@@ -370,6 +370,26 @@ def _descend(fit: PathFit, *, rough: int = 0, target: float = math.inf) -> PathF
             fit = _differentiate(fit, fit.widths)
         is_fresh, before = True, math.inf
     return fit
+
+
+def _try_step(
+    fit: PathFit, moving: Sequence[Free], step: Sequence[float], cost: float, expected_fall: float
+) -> tuple[ModelState, Floats, float]:
+    """State, residual and fall of the cost after a step, doubled while it falls further.
+
+    Where the cost falls by more than a step promised, it is less curved than its derivatives say, and as
+    many short steps would be needed: along a trade of a delay with slip, fits ended half-way.
+    """
+    path, best, times = fit.path, (fit.state, fit.residual, 0.0), 1.0
+    while True:
+        state = fit.state.move(moving, [times * one for one in step])
+        residual = path.find_residuals(state)
+        fall = cost - measure_cost(path, fit.noise, state, fit.free, residual)
+        if fall <= max(best[2], 0.0):
+            return best if times > 1.0 else (state, residual, fall)
+        best, times = (state, residual, fall), 2.0 * times
+        if fall < _FLATTER * expected_fall or times > _LONGEST:
+            return best
 
 
 def find_unlearned(path: PathResiduals) -> float:

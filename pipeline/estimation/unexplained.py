@@ -109,7 +109,10 @@ def suggest(
             for held in (assessment.whole.held_out, step.held_out)
         )
         falls = 1.0 - after / np.maximum(before, 1e-18)
-        channel = CHANNELS[int(np.argmax(falls))][-1]
+        # What the term itself changes, where that falls: the other effects of the model changed with it.
+        own = np.array([name in formula.formulas for name in CHANNELS])
+        index = int(np.argmax(np.where(own & (falls > 0.0), falls, falls - 1e3)))
+        channel = CHANNELS[index][-1]
         fitted = step.fitted.model.effect(formula.id)
         channels = tuple(name[-1] for name, fall in zip(CHANNELS, falls.tolist(), strict=True) if fall > 0.0)
         said: LadderStep | None = step
@@ -119,7 +122,7 @@ def suggest(
             said = said if lowers_errors(leading.whole.errors, said.errors) else None
         unexplained = Unexplained(
             "formula",
-            float(falls.max()),
+            float(falls[index]),
             channel,
             channels or (channel,),
             assessment.data.source.value,

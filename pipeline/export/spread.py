@@ -3,7 +3,6 @@
 The fitted model is driven by a constant command until its motion is steady.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,16 +10,13 @@ import numpy as np
 
 from pipeline.core import Floats
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Facts
-from pipeline.models import Effect, ForwardModel, Place, Timing
-from pipeline.run import DriveSeries, Grid, Resets, RunContext
+from pipeline.models import Effect, Place, predict_step
 from pipeline.sources import Vehicle
 
 _SPEEDS = 4
 """Number of speeds: quarters of the largest driven one show a factor that falls or rises with speed."""
 _STEADY_S = 20.0
 """Time until the motion counts as steady [s]: twenty times the longest lag that vehicles have."""
-_STEP_S = 0.02
-"""Step of the model [s], that of its fits."""
 _USUAL_TOP = (1.0, 0.5)
 """Speed [m/s] and yaw rate [rad/s] if neither the fit nor the vehicle gives the largest ones."""
 _SAME = 0.01
@@ -38,40 +34,9 @@ def find_steady_motion(
         speed: commanded speed [m/s].
         turn: commanded yaw rate [rad/s].
     """
-    count = round(_STEADY_S / _STEP_S)
-    times: Floats = (np.arange(count, dtype=np.float64) + 0.5) * _STEP_S
-    zero = np.zeros(1, dtype=np.int64)
-    grid = Grid(_STEP_S, times, np.zeros(count, dtype=np.int64), zero, np.zeros(1), np.array((_STEADY_S,)))
-    context = RunContext(
-        vehicle=vehicle, times=times, start_s=0.0, step_s=_STEP_S, duration_s=_STEADY_S,
-        spans=_reset(count, 4), wheels=_reset(count, 4), body=_reset(count, 3),
-        attitude=np.zeros((count, 3)), position=np.zeros((count, 2)),
-    )  # fmt: skip
-    body = (np.array((speed,)), np.zeros(1), np.array((turn,)))
-    inputs = {name: float(value[0]) for name, value in vehicle.kinematics.inverse(body, vehicle).items()}
-    own = inputs.get("speed", 0.0) / vehicle.wheel_radius_m
-    stamps = np.arange(0.0, _STEADY_S, 0.05)
-
-    def hold(value: float) -> Floats:
-        return np.full(stamps.size, value)
-
-    series = DriveSeries(
-        stamps,
-        hold(inputs.get("left", own)),
-        hold(inputs.get("right", own)),
-        hold(inputs.get("steering", 0.0)),
-        hold(inputs["sideways"]) if "sideways" in inputs else None,
-    )
-    forward = ForwardModel(series, grid, context, encoders=None, has_gyro=False)
     acting = [effect for effect in effects if effect.place is not Place.LOCALIZATION]
-    moved = forward.run_commands(acting, Timing())
+    moved = predict_step(vehicle, acting, speed, turn, _STEADY_S)
     return float(moved.x[-1]), float(moved.w[-1])
-
-
-def _reset(count: int, signals: int) -> Resets:
-    """A run that begins once, at rest or with its first input."""
-    zero = np.zeros(1, dtype=np.int64)
-    return Resets(np.zeros(count, dtype=np.int64), zero, zero, np.full((1, signals), math.nan))
 
 
 class Response(NamedTuple):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.models.model_text import *
     from pipeline.models.number import *
     from pipeline.models.parameter import *
+    from pipeline.models.step import *
 else:
     __getattr__ = open_door(
         __name__,
@@ -117,5 +118,6 @@ else:
                 "is_of_one_run",
                 "stands_at_bound",
             ),
+            "step": ("predict_step",),
         },
     )

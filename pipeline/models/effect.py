@@ -235,13 +235,19 @@ class Effect(ABC):
         return does or f"shows signs of {self.id.replace('_', ' ')}"
 
     def _make_sentences(self, vehicle: Vehicle, beside: Iterable[Effect]) -> Sentences:
+        beside = tuple(beside)
         others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}
         title = self.id.replace("_", " ").capitalize()
-        values = {**self.values, **self.list_seen(vehicle)}
+        values = {**self.values, **self.list_seen(vehicle, beside)}
         return Sentences(title, find_words(self.id), values, vehicle, self.open_numbers, others)
 
-    def list_seen(self, vehicle: Vehicle) -> Mapping[str, float]:
-        """Numbers that its sentences have beside its own: what a person sees of it, by name."""
+    def list_seen(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> Mapping[str, float]:
+        """Numbers that its sentences have beside its own: what a person sees of it, by name.
+
+        Args:
+            vehicle: its nominal geometry.
+            beside: all effects of the model.
+        """
         return {}
 
     def can_show(self, conditions: Conditions) -> bool:

@@ -29,19 +29,20 @@ slip angle, Pacejka, Tire and Vehicle Dynamics, chapter 3; measured on the DRIVE
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from pipeline.core import Floats
-from pipeline.models.effect import INF, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import INF, Effect, Excitation, Least, Parameter, Place, Plausible, Search
 from pipeline.models.families import TIME_CONSTANT
 from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
-from pipeline.run import RunContext, Wheels
+from pipeline.models.step import STEP_CELL_S, predict_step
+from pipeline.run import HORIZON_S, RunContext, Wheels
 from pipeline.sources import Vehicle
 
 _LEAST_TAU_S = 0.01
@@ -58,8 +59,8 @@ _OTHER_RIM = 1.5
 """Ratio of speeds of rims from which starts are scaled: a bound that never acts has no derivative."""
 _ALIKE_AT, _SLOPES = 3.0, (0.5, 0.7, 1.4, 2.0)
 """Speed [m/s] at which other motors have the same force, and how fast theirs falls, by that of this one."""
-_STEP_MPS, _STEP_CELL_S, _WATCHED_S = 1.0, 0.01, 5.0
-"""Step of the command by which it is described [m/s], width of a cell, and how long it is watched [s]."""
+_STEP_MPS, _WATCHED_S = 1.0, 5.0
+"""Step of the command by which it is described [m/s], and how long it is watched straight ahead [s]."""
 _RISEN, _NEARLY_ALL = 1.0 - math.exp(-1.0), 0.98
 """Share of a step after one time constant, and share that counts as all of it."""
 _TINY = 1e-6
@@ -242,28 +243,24 @@ class WheelServo(JointDrive):
             for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
         ]
 
-    def list_seen(self, vehicle: Vehicle) -> dict[str, float]:
-        """What it makes of a step of the command from rest, straight ahead and on the spot.
+    def list_seen(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> dict[str, float]:
+        """What the whole drive makes of a step of the command from rest, straight ahead and on the spot.
 
         Returns:
             ``asked``, the speed of the step [m/s]; ``rise``, time to 63 % of it straight ahead [s], NaN where
-            it is not reached; ``turned``, the share of it that both sides keep on the spot, NaN where it is
-            nearly all.
+            it is not reached; ``turn``, the yaw rate with that speed of either side [rad/s]; ``turned``, the
+            share of it that the wheels have after two seconds, NaN where it is nearly all.
         """
         step = min(_STEP_MPS, vehicle.max_speed_mps or math.inf)
-        seen = {"asked": step, "rise": math.nan, "turned": math.nan}
+        turn = 2.0 * step / vehicle.kinematics.turning_width_m(vehicle)
+        seen = {"asked": step, "rise": math.nan, "turn": turn, "turned": math.nan}
         if self.is_neutral or any(map(math.isnan, self.values.values())):
             return seen
-        asked = np.zeros((2, 3, round(_WATCHED_S / _STEP_CELL_S)))
-        asked[:, :2] = step
-        asked[1, 0] *= -1.0
-        numbers = self.list_numbers(vehicle.track_width_m or 1.0, 0.0)
-        start = np.zeros(1, dtype=np.int64), np.zeros((2, 3, 1))
-        straight, spinning = walk_each([numbers, numbers], [0, 1], asked, *start, _STEP_CELL_S)
-        share = straight.mean(axis=0) / step
-        if share.max() >= _RISEN:
-            seen["rise"] = float(np.argmax(share >= _RISEN) + 1) * _STEP_CELL_S
-        turned = float(spinning[1, -1] - spinning[0, -1]) / (2.0 * step)
+        drive = [one for one in beside if one.place <= Place.DRIVE and one.id != self.id]
+        straight = predict_step(vehicle, [*drive, self], step, 0.0, _WATCHED_S).x / step
+        if straight.max() >= _RISEN:
+            seen["rise"] = float(np.argmax(straight >= _RISEN) + 1) * STEP_CELL_S
+        turned = float(predict_step(vehicle, [*drive, self], 0.0, turn, HORIZON_S).w[-1]) / turn
         return seen | ({"turned": turned} if turned < _NEARLY_ALL else {})
 
     def list_numbers(self, track_m: float, imbalance: float) -> Floats:
