@@ -35,7 +35,9 @@ _BLOCK = re.compile(r"^```(console|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL
 _PROMPTS = {"console": ("$ ", ()), "pycon": (">>> ", ("... ", "...\n"))}
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 _HASH = re.compile(r"\b[0-9a-f]{12,}\b")
-_NEAR = {"rel_tol": 0.1, "abs_tol": 0.03}
+_NEAR = 0.01
+"""Share by which numbers may differ, beside one unit of the last digit shown: other versions of the libraries
+that fits stand on change no more."""
 _LINKED = (
     "Makefile",
     "pyproject.toml",
@@ -161,7 +163,7 @@ def _run_server(text: str, folder: Path, around: dict[str, str]) -> str:
 def find_difference(shown: tuple[str, ...], printed: str) -> str:
     """The first line that is printed otherwise than shown; empty without one.
 
-    Words must be the same; numbers may differ by 10 %, as of other versions of libraries; hashes by all.
+    Words must be the same; numbers may differ by 1 % or in the last digit; hashes by all.
     """
     lines = [line.rstrip() for line in printed.rstrip("\n").splitlines()]
     for one, other in zip_longest(shown, lines, fillvalue=""):
@@ -175,7 +177,16 @@ def _is_alike(one: str, other: str) -> bool:
     if _NUMBER.sub("#", one) != _NUMBER.sub("#", other):
         return False
     pairs = zip(_NUMBER.findall(one), _NUMBER.findall(other), strict=True)
-    return all(math.isclose(float(a), float(b), **_NEAR) for a, b in pairs)
+    return all(
+        math.isclose(float(a), float(b), rel_tol=_NEAR, abs_tol=1.001 * max(_find_unit(a), _find_unit(b)))
+        for a, b in pairs
+    )
+
+
+def _find_unit(number: str) -> float:
+    """One unit of the last digit of a number as it is written."""
+    digits, _, power = number.partition("e")
+    return 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
 
 
 _DRIVER = """

@@ -472,7 +472,7 @@ class Check:
     Attributes:
         verdict: what changed, and whether it is more than runs differ anyway.
         numbers: one row each: ``number unit status change_is before after difference low high spread freedom
-            p p_adjusted smallest``; status is ``changed``, ``differs``, ``unclear``, ``unchanged`` or
+            p p_adjusted smallest``; status is ``changed``, ``differs``, ``not shown``, ``unchanged`` or
             ``unknown``.
         limits: one row each: ``name limit measured outcome``.
         code: 0 kept, 4 changed or broken, 3 undetermined.

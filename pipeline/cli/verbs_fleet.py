@@ -147,6 +147,7 @@ def trend(  # noqa: D417 - arguments document themselves
     by: Annotated[
         str, Parameter(help="groups for slip: dataset, vehicle, terrain, or several of them")
     ] = "dataset",
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -155,11 +156,12 @@ def trend(  # noqa: D417 - arguments document themselves
     Writes trend.html. Parameters are followed by vehicle, beside what its terrains differ by.
 
     Args:
+        everything: also print the series that cannot be tested.
         json: print one JSON object.
         quiet: print nothing.
     """
     followed = api.follow_trend(results, by)
     page = followed.page
     content = {**followed.result.to_json(), "page": None if page is None else str(page)}
-    lines = words.format_trend(followed.result) + ([f"page    {page}"] if page else [])
+    lines = words.format_trend(followed.result, everything=everything) + ([f"page    {page}"] if page else [])
     return print_result(content, lambda: lines, json=json, quiet=quiet)

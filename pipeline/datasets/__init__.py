@@ -11,6 +11,7 @@ from pipeline.door import open_door
 if TYPE_CHECKING:
     from pipeline.datasets.causes import *
     from pipeline.datasets.check import *
+    from pipeline.datasets.check_readings import *
     from pipeline.datasets.compare import *
     from pipeline.datasets.compared_runs import *
     from pipeline.datasets.deployments import *
@@ -33,6 +34,12 @@ else:
                 "CheckedNumber",
                 "check_runs",
                 "read_limits",
+            ),
+            "check_readings": (
+                "COMMANDED_TURN",
+                "HEADING_ERROR",
+                "MULTIPLIER",
+                "POSITION_ERROR",
             ),
             "compare": (
                 "ABOUT_UNIT",
@@ -60,6 +67,8 @@ else:
                 "ALIKE",
                 "DIFFERENT",
                 "OF_TWO_RUNS",
+                "OTHERS_SPREAD",
+                "OVER_RUNS",
                 "THIS_RUN",
                 "UNTESTED",
                 "judge_pair",

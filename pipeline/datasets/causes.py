@@ -316,7 +316,7 @@ def find_causes(store: Store, question: Question) -> Causes:
         raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
     untested = find_untested(compared, question)
     budgets, differences = compare_causes(own, untested=untested)
-    notes = (*compared.notes, *note_untested(untested))
+    notes = (*compared.count_omitted(len(compared.keys)), *compared.notes, *note_untested(untested))
     return Causes(budgets, differences, source, name_causes(store), compared.keys, notes)
 
 

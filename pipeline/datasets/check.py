@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import (
+    FEWEST_OF_SPREAD,
     TomlError,
     finite_or_none,
     format_share,
@@ -44,8 +45,10 @@ KEPT, UNDETERMINED, BROKEN = 0, 3, 4
 """Exit codes of a check."""
 _HINT = "The handbook, Check a change, lists the keys."
 _LEAST_VARIANCE = 1e-24
+_SHARE = 0.25
+"""Change of the share of a commanded turn or of a multiplier that must not be missed."""
 Outcome = Literal["kept", "broken", "undetermined"]
-Status = Literal["changed", "differs", "unclear", "unchanged", "unknown"]
+Status = Literal["changed", "differs", "not shown", "unchanged", "unknown"]
 
 
 Limit = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
@@ -137,7 +140,9 @@ class CheckedNumber:
         p: probability of a difference as large without a change; by the errors alone where no runs tell.
         p_adjusted: p over all numbers of the check (Benjamini and Hochberg).
         smallest: change that these runs show with a probability of 80 %.
-        size: distance of the number from doing nothing, at least the usual one; one of shares.
+        size: largest change that may be missed of what is `unchanged`: distance of a parameter from doing
+            nothing, at least the usual one; a doubling of errors; a quarter of the share of a commanded turn
+            and of the controller's multiplier.
     """
 
     name: str
@@ -167,14 +172,20 @@ class CheckedNumber:
     def status(self) -> Status:
         """What is shown of the number.
 
-        `differs` is beyond the errors of these recordings, where no runs tell how much runs differ. Of what
-        is `unclear` a change as large as the number itself could have been missed.
+        `differs` is beyond the errors of these recordings, where no runs tell how much runs differ. What is
+        `not shown` may have changed: its interval does not hold zero, or a change as large as `size` could
+        have been missed.
         """
         if not self.is_known:
             return "unknown"
         if self.p_adjusted > CHANCE:
-            return "unchanged" if self.smallest <= self.size else "unclear"
+            return "unchanged" if self.low <= 0.0 <= self.high and not self.is_coarse else "not shown"
         return "changed" if math.isfinite(self.spread) else "differs"
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether a change as large as `size` could have been missed."""
+        return not self.smallest <= self.size
 
     def to_json(self) -> dict[str, object]:
         """The row of `slip check --json`."""
@@ -226,6 +237,12 @@ class RunsCheck:
         return any(math.isfinite(one.spread) for one in self.numbers if one.name != MULTIPLIER)
 
     @property
+    def missing(self) -> int:
+        """Further runs on the sides from which on they tell how much runs differ; 0 if they do."""
+        groups = [group for group, _ in self.sides.grouped]
+        return 0 if self.is_spread_known else max(FEWEST_OF_SPREAD - 1 - len(groups) + len({*groups}), 1)
+
+    @property
     def is_single(self) -> bool:
         """Whether there is one run a side, and nothing tells how much runs differ."""
         counts = {len(side) for side in (self.sides.before, self.sides.after)}
@@ -246,8 +263,9 @@ class RunsCheck:
             return BROKEN if "broken" in outcomes else UNDETERMINED if "undetermined" in outcomes else KEPT
         if self.list_status("changed"):
             return BROKEN
-        unclear = [one for one in self.list_status("unclear") if one.name not in LOGARITHMS]
-        is_open = self.is_single or bool(unclear) or bool(self.list_status("differs"))
+        coarse = [one for one in self.list_status("not shown") if one.is_coarse]
+        missed = any(one.name not in LOGARITHMS for one in coarse)
+        is_open = self.is_single or missed or bool(self.list_status("differs"))
         is_decided = self.is_compared and not is_open
         return KEPT if is_decided else UNDETERMINED
 
@@ -331,7 +349,11 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
         )
         for label in sides.labels
     ]
-    blank += [CheckedNumber(name, _TITLES[name], ERRORS.get(name, "1"), is_ratio=True) for name in LOGARITHMS]
+    blank += [
+        CheckedNumber(name, _TITLES[name], unit, is_ratio=True, size=1.0 if name in ERRORS else _SHARE)
+        for name in LOGARITHMS
+        for unit in [ERRORS.get(name, "1")]
+    ]
     kinds = {label.name: label.parameter for label in sides.labels}
     numbers = []
     for one in blank:

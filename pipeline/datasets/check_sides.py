@@ -40,7 +40,8 @@ class Sides:
         labels: compared parameters.
         before, after: estimates of the runs; a model file as BEFORE counts as one run with its values.
         notes: excluded runs with the reasons, and warnings.
-        others: further runs of the vehicle on the same terrains, by terrain: they tell how much runs differ.
+        others: further runs of the vehicle on the same terrains, by terrain: several of one tell how much
+            runs differ.
         is_model: whether BEFORE is a model file.
     """
 
@@ -57,6 +58,12 @@ class Sides:
     def terrains(self) -> tuple[list[str], list[str]]:
         """Terrains of both sides."""
         before, after = (sorted({one.terrain for one in side} - {""}) for side in (self.before, self.after))
+        return before, after
+
+    @property
+    def paces(self) -> tuple[float, float]:
+        """Root mean square ideal speed of both sides [m/s], see `RunReading`; NaN of a model."""
+        before, after = (float(np.mean([one.pace for one in side])) for side in (self.before, self.after))
         return before, after
 
     @property
@@ -143,7 +150,7 @@ def _list_others(store: Store, sides: Sides, held: Collection[str]) -> list[Mani
 def _read_others(
     manifests: Sequence[Manifest], sides: Sides, store: Store
 ) -> dict[str, tuple[RunReading, ...]]:
-    """Estimates of further runs by terrain; what cannot be fitted, and what is alone, tells no spread."""
+    """Estimates of further runs by terrain, of those that can be fitted."""
     vehicle = sides.model.model.vehicle
     readings: dict[str, list[RunReading]] = {}
     for manifest in manifests:
@@ -153,7 +160,7 @@ def _read_others(
             agree_on_vehicle(vehicle, {manifest.run: load_vehicle(manifest)}, None)
             reading = read_run(load_motion_run(manifest, vehicle), start, sides.source, sides.labels)
             readings.setdefault(reading.terrain, []).append(reading)
-    return {terrain: tuple(runs) for terrain, runs in readings.items() if len(runs) > 1}
+    return {terrain: tuple(runs) for terrain, runs in readings.items()}
 
 
 def _leave_out_refused(manifests: Sequence[Manifest], side: str) -> tuple[list[Manifest], list[str]]:

@@ -22,7 +22,6 @@ from pipeline.datasets.compared_runs import (
 from pipeline.datasets.equal_driving import Levelled, find_overlap, level_runs, measure_bins
 from pipeline.datasets.pairs import (
     BLOCKS,
-    OVER_RUNS,
     THIS_RUN,
     Group,
     SlipSamples,
@@ -31,6 +30,7 @@ from pipeline.datasets.pairs import (
     compare_groups,
     connect_groups,
     level_groups,
+    name_interval,
     tabulate_pairs,
 )
 from pipeline.datasets.pooling import pool_runs
@@ -166,7 +166,12 @@ class _Comparison:
             families=self.families,
             runs=self.runs,
             features=_list_features(self.compared, self.runs),
-            notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
+            notes=(
+                *self.compared.count_omitted(self.runs["run"].n_unique()),
+                *self.compared.notes,
+                *dict.fromkeys(self.notes),
+                *note_untested(self.untested),
+            ),
         )
 
     def _follow_published(self) -> dict[str, SlipSamples]:
@@ -349,7 +354,8 @@ def _list_levels(datasets: pl.DataFrame, input_name: str, quantity: str) -> pl.D
     """Value and interval of a quantity, one row per dataset that has it."""
     low, high, about = ("low", "high", pl.col("interval"))
     if quantity == EQUAL_DRIVING:
-        low, high, about = ("equal_low", "equal_high", pl.lit(OVER_RUNS))
+        about = pl.col("runs").map_elements(name_interval, return_dtype=pl.String)
+        low, high = ("equal_low", "equal_high")
     return datasets.filter(pl.col("input") == input_name, pl.col(quantity).is_not_null()).select(
         pl.lit(input_name).alias("input"),
         pl.lit(quantity).alias("quantity"),
@@ -368,7 +374,7 @@ def _bound_published(groups: Sequence[Group], families: Mapping[str, Sequence[st
         own = [group for group in groups if group.name in datasets]
         for group, ends in zip(own, bound_groups([group.values for group in own]), strict=True):
             single = bound_run(group.runs[0]) if len(group.runs) == 1 and ends is None else None
-            about = OVER_RUNS if ends else THIS_RUN if single else ""
+            about = name_interval(len(group.runs)) if ends else THIS_RUN if single else ""
             low, high = ends or single or (None, None)
             rows.append(
                 ("command", AS_PUBLISHED, group.name, float(np.median(group.values)), low, high, about)

@@ -48,6 +48,7 @@ class ComparedRuns:
         notes: excluded runs with the reasons.
         refusals: reasons why slip is not observable, by run.
         date_notes: contradictory dates, and runs whose order is not known.
+        total: number of runs that could count: all of the results, or those that were asked for.
     """
 
     labels: pl.DataFrame
@@ -56,6 +57,12 @@ class ComparedRuns:
     notes: tuple[str, ...]
     refusals: Mapping[str, str] = field(default_factory=dict)
     date_notes: tuple[str, ...] = ()
+    total: int = 0
+
+    def count_omitted(self, number: int) -> tuple[str, ...]:
+        """A note that stands before those on what is left out: how many runs, if not all count."""
+        omitted = self.total - number
+        return (f"left out: {omitted} of the {self.total} runs in the results",) if omitted > 0 else ()
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -107,6 +114,7 @@ def find_material(
     optional = (*optional, "findings") if trusted_only else optional
     survey = store.survey()
     notes = [f"left out, damaged: {error}" for error in survey.errors]
+    total = len(survey.manifests) + len(survey.errors)
     reasons: dict[str, list[str]] = {}
     manifests: dict[str, Manifest] = {}
     holders: dict[str, str] = {}
@@ -138,7 +146,7 @@ def find_material(
         pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
     )
     labels = label_runs(dated, by)
-    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, date_notes)
+    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, date_notes, total)
     if vehicle in set(labels["vehicle"]):
         compared = choose_runs(compared, vehicle, ())
     reason = f"{' and '.join(by)} unknown, not pooled"
@@ -180,7 +188,8 @@ def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> 
     rows = rows.filter(pl.col("group").is_in(list(groups))) if groups else rows
     runs = set(rows["run"])
     manifests = {run: manifest for run, manifest in compared.manifests.items() if run in runs}
-    return replace(compared, labels=rows, manifests=manifests)
+    total = len(manifests) if vehicle or groups else compared.total
+    return replace(compared, labels=rows, manifests=manifests, total=total)
 
 
 def keep_runs(compared: ComparedRuns, runs: Sequence[str], reason: str) -> ComparedRuns:

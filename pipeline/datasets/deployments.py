@@ -108,7 +108,7 @@ def draw_up_map(
     missing = rated.filter(is_placed.not_().fill_null(value=True))["key"].to_list()
     compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
     chosen = fed or ("command" if runs.is_empty() else choose_input(runs))
-    notes, measure = list(compared.notes), MEASURES[show]
+    notes, measure = [*compared.count_omitted(len(compared.keys)), *compared.notes], MEASURES[show]
     kinds = dict.fromkeys(("dataset", "vehicle", "terrain"), pl.String) | {"runs": pl.Int64}
     own = pl.DataFrame(schema=kinds | dict.fromkeys(("energy", "complexity", "value"), pl.Float64))
     if not runs.is_empty():

@@ -61,6 +61,8 @@ class FleetNumber:
         spread_terrain, spread_run: standard deviations between terrains and between runs of a terrain.
         terrains: by name.
         named: number of runs whose diagnosis reports the effect.
+        disagreeing: values of the runs, ascending, where they differ by more than their errors and the usual
+            spread between runs explain; else empty.
     """
 
     effect: str
@@ -76,6 +78,7 @@ class FleetNumber:
     spread_run: float | None
     terrains: dict[str, Band]
     named: int
+    disagreeing: tuple[float, ...] = ()
 
     @property
     def label(self) -> str:
@@ -111,18 +114,20 @@ class Fleet:
     @property
     def summary(self) -> str:
         """How many numbers are of which level, and what would decide the open ones."""
-        counts = Counter(number.level for number in self.numbers)
+        counts = Counter(number.level for number in self.numbers if not number.disagreeing)
+        disagree = sum(bool(number.disagreeing) for number in self.numbers)
         runs = sum(map(len, self.runs.values()))
         fitted = f"{format_count(runs, 'run')} of {format_count(len(self.runs), 'vehicle')}"
-        if not counts:
+        if not self.numbers:
             return f"No significant effect in {fitted}."
         parts = [
             f"{counts[level]} of the {level}" for level in ("vehicle", "terrain", "run") if counts[level]
         ]
+        parts += [f"{disagree} on which runs disagree"] if disagree else []
         parts += [f"{counts[None]} open"] if counts[None] else []
         text = f"{format_count(len(self.numbers), 'parameter')} in {fitted}: {enumerate_texts(parts)}."
         advice = " To decide, diagnose more runs, several on each of two or more terrains."
-        return text + advice * bool(counts[None])
+        return text + advice * bool(counts[None] or disagree)
 
     def to_json(self) -> dict[str, object]:
         """The JSON object of `slip fleet show`."""
@@ -171,7 +176,8 @@ def fit_results(store: Store) -> Fleet:
         hint = mend if refused else "Name the effects of its logs: slip batch LOGS --diagnosis"
         raise lack_runs("nothing_to_fit", "no run has estimates", store.root, hint, compared.notes)
     fleet = fit_fleet(compared.read_estimates())
-    return Fleet(fleet.numbers, fleet.runs, (*compared.notes, *fleet.notes), compared.keys)
+    notes = (*compared.count_omitted(len(compared.keys)), *compared.notes, *fleet.notes)
+    return Fleet(fleet.numbers, fleet.runs, notes, compared.keys)
 
 
 def fit_fleet(estimates: pl.DataFrame) -> Fleet:
@@ -254,6 +260,12 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     fit = _fit(rows)
     pooled = fit.pool()
     level, because = decide_level(fit, pooled, number)
+    # Of what is the ground's or the run's own, values may differ.
+    apart = [] if level in {Level.TERRAIN, Level.RUN} else _find_apart(rows, number)
+    if apart:
+        because = f"; {because}" if level is None else ""
+        because = f"runs disagree by more than {number.spread.size:.2g}: {', '.join(apart)}{because}"
+        level = None
     # A pose clock that gyros determine was corrected before the fit: it has no other name.
     dated = kind.late is Late.POSES and not rows["in_model"].any()
     readings = {} if dated else {reading.level: reading.name for reading in kind.readings}
@@ -290,7 +302,17 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
             for i, name in enumerate(fit.names)
         },
         named=int(rows["named"].sum()),
+        disagreeing=tuple(rows["value"].sort()) if apart else (),
     )
+
+
+def _find_apart(rows: pl.DataFrame, number: Parameter) -> list[str]:
+    """Runs with their values, ascending, if they differ by more than errors and the usual spread explain."""
+    errors = rows["standard_error"].to_numpy() ** 2 + number.spread.size**2
+    fit = fit_levels(rows["value"].to_numpy(), ["*"] * rows.height, errors, fewest=1)
+    if not fit.p_spread < SURE:
+        return []
+    return [f"{run} {value:.3g}" for run, value in rows.select("run", "value").sort("value").iter_rows()]
 
 
 def _cut(number: Parameter, ends: tuple[float, float]) -> tuple[float | None, float | None]:
@@ -312,7 +334,7 @@ def decide_level(fit: Levels, pooled: Pooled, number: Parameter) -> tuple[Level 
         pooled: of the vehicle.
         number: the parameter, which may declare its level, as a controller's gain does.
     """
-    if number.level is not None:
+    if number.level is not None and fit.counts.sum() > 1.0:
         return number.level, f"by its nature {_WHOSE[number.level]}"
     if open_because := _find_open(fit, pooled):
         return None, open_because
@@ -333,6 +355,8 @@ def decide_level(fit: Levels, pooled: Pooled, number: Parameter) -> tuple[Level 
 
 def _find_open(fit: Levels, pooled: Pooled) -> str:
     """Why terrain and run cannot be separated, and which runs would separate them; empty if they can."""
+    if fit.counts.sum() == 1.0:
+        return "only one run determines it: more tell whether it is the vehicle's, the ground's or the run's"
     if len(fit.names) == 1:
         only = f"only runs on {fit.names[0]} determine it"
         return f"{only}: runs on another terrain separate vehicle and terrain"

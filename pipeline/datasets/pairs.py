@@ -17,6 +17,9 @@ RUNS = "runs"
 BLOCKS = "blocks"
 OVER_RUNS = "over runs"
 THIS_RUN = "this run only"
+OTHERS_SPREAD = "one run, spread of the others"
+"""What intervals say: over the runs of a dataset; of one run alone; or of one run, with the spread of
+the runs of the vehicle's other datasets."""
 PARTS = 8
 """Most parts of a single run: medians of eight equal parts of 2 to 10 minutes are called different in 4 to
 7 % of equal runs whose slip remembers 0.5 to 2.5 s."""
@@ -72,6 +75,11 @@ class Group:
     def of_runs(cls, name: str, runs: Sequence[SlipSamples]) -> "Group":
         """Group whose runs are compared by their medians."""
         return cls(name, np.array([np.median(run.values) for run in runs]), tuple(runs))
+
+
+def name_interval(runs: int) -> str:
+    """What an interval by a spread that datasets share says of a dataset of so many runs."""
+    return OVER_RUNS if runs > 1 else OTHERS_SPREAD
 
 
 def bound_groups(groups: Sequence[Floats]) -> list[tuple[float, float] | None]:

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError, group_by
-from pipeline.datasets.pairs import OVER_RUNS, THIS_RUN, bound_groups
+from pipeline.datasets.pairs import THIS_RUN, bound_groups, name_interval
 from pipeline.run import MOVING_MPS
 from pipeline.stages import find_fastest
 
@@ -396,7 +396,7 @@ def _bound_groups(
         for index, interval in zip(indices, over_runs, strict=True):
             one = within.get((rows[index]["only"], rows[index]["input"]))
             if interval is not None:
-                bounds[index] = (*interval, OVER_RUNS)
+                bounds[index] = (*interval, name_interval(len(rows[index][column])))
             elif one is not None:
                 bounds[index] = (*one, THIS_RUN)
     return {

@@ -13,7 +13,8 @@ from pipeline.datasets.levels import LEVEL, adjust
 from pipeline.datasets.pooling import gather_runs
 from pipeline.store import Store, lack_runs
 
-_SLIP = ("median_modulus", "median_window_norm")
+FEWEST_OF_TEST = 2 * FEWEST_OF_SPREAD
+"""Runs of a series from which on a step can be tested, half of them on either side."""
 _DRAWS = 1_999
 """Random orders of a test: p = 0.05 is then known to a standard error of 0.005."""
 
@@ -64,9 +65,12 @@ class Series:
         """The series in a sentence: its last value, and the step where there is one."""
         unit = suffix_unit(self.unit)
         text = f"{format_count(self.points.height, 'run')}, latest {self.points['value'][-1]:.3g}{unit}"
-        if self.step is None or not self.is_changed:
-            few = ", too few for a test" if self.step is None else ", no significant step"
-            return text + few
+        if self.step is None:
+            repeated = _take_repeated(self.points).height
+            few = f", no test: {repeated} of the {FEWEST_OF_TEST} runs on terrains driven twice that it takes"
+            return text + (few if repeated < FEWEST_OF_TEST else ", no test: all values are the same")
+        if not self.is_changed:
+            return f"{text}, no significant step"
         change = f"{self.step.before:.3g} -> {self.step.after:.3g}{unit}"
         return f"{text}, {change} since {self.step.since} (p = {self.step.p_adjusted:.2g} over all series)"
 
@@ -78,6 +82,16 @@ class Trend:
     series: tuple[Series, ...]
     notes: tuple[str, ...]
     keys: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """How many series could be tested, and how many have a step."""
+        tested = [one for one in self.series if one.step is not None]
+        if not tested:
+            need = f"a series takes {FEWEST_OF_TEST} dated runs on terrains that were driven twice or more"
+            return f"Nothing can be tested: {need}"
+        steps = format_count(sum(one.is_changed for one in tested), "significant step")
+        return f"{steps} in {len(tested)} of {len(self.series)} series that could be tested"
 
     def to_json(self) -> dict[str, object]:
         """The JSON object of `slip fleet trend`."""
@@ -91,7 +105,7 @@ class Trend:
             }
             for one in self.series
         ]
-        return {"series": series, "notes": list(self.notes)}
+        return {"summary": self.summary, "series": series, "notes": list(self.notes)}
 
 
 def follow_trend(store: Store, by: Sequence[str]) -> Trend:
@@ -118,16 +132,15 @@ def follow_trend(store: Store, by: Sequence[str]) -> Trend:
     for (group, source), rows in slip.partition_by(
         "group", "input", as_dict=True, maintain_order=True
     ).items():
-        for name in _SLIP:
-            points = rows.select("day", "run", "terrain", pl.col(name).alias("value")).drop_nulls()
-            series += [Series(str(group), f"{name} ({source})", "m/s", points)] if points.height else []
+        points = rows.select("day", "run", "terrain", pl.col("median_modulus").alias("value")).drop_nulls()
+        series += [Series(str(group), f"median_modulus ({source})", "m/s", points)] if points.height else []
     days = dated.select("order", "run", "day")
     for vehicle, effect, parameter, rows in list_numbers(compared.read_estimates().join(days, on="run")):
         own = rows.filter(pl.col("in_model") | pl.col("named")).sort("order")
         points = own.select("day", "run", "terrain", "value")
         series.append(Series(vehicle, f"{effect}.{parameter}", str(own["unit"][0]), points))
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
-    return Trend(tuple(find_steps(series)), tuple(notes), keys)
+    return Trend(tuple(find_steps(series)), (*compared.count_omitted(len(keys)), *notes), keys)
 
 
 def find_steps(series: Sequence[Series]) -> list[Series]:
@@ -141,15 +154,20 @@ def find_steps(series: Sequence[Series]) -> list[Series]:
     return sorted(judged, key=lambda one: (not one.is_changed, one.group, one.quantity))
 
 
+def _take_repeated(points: pl.DataFrame) -> pl.DataFrame:
+    """Runs on terrains that were driven more than once: the others say nothing of a step."""
+    return points.filter(pl.len().over("terrain") > 1)
+
+
 def _find_step(points: pl.DataFrame) -> Step | None:
     """The split with the largest Mann-Whitney statistic, beside what terrains differ by; p by permutation."""
     from scipy.stats import permutation_test, rankdata  # noqa: PLC0415 - heavy
 
     mean = pl.col("value").mean()
-    several = points.filter(pl.len().over("terrain") > 1)
+    several = _take_repeated(points)
     rest = several.select(pl.col("value") - mean.over("terrain") + mean).to_series().to_numpy()
     count = rest.size
-    if count < 2 * FEWEST_OF_SPREAD or float(np.ptp(rest)) == 0.0:
+    if count < FEWEST_OF_TEST or float(np.ptp(rest)) == 0.0:
         return None
     before = np.arange(FEWEST_OF_SPREAD, count - FEWEST_OF_SPREAD + 1)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec.structs import replace as replace_fields
 
-from pipeline.core import NORMAL_95, round_digits
+from pipeline.core import NORMAL_95
 from pipeline.estimation.driving_need import measure_driven
 from pipeline.estimation.fit import PathFit, find_unlearned, invert
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
@@ -23,8 +23,7 @@ from pipeline.models import (
     Late,
     Model,
     Number,
-    Parameter,
-    cut_interval,
+    expect_another_run,
     find_late,
     is_of_one_run,
     list_effects,
@@ -81,21 +80,6 @@ def list_first_run(state: ModelState, estimates: Estimates) -> dict[str, dict[st
     """Values of every effect of a fitted state in the first run, by id."""
     first = estimates.choose_run(0)
     return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
-
-
-def expect_another_run(parameter: Parameter, number: Number) -> Interval:
-    """95 % interval of a number in another run on the same ground, NaN where this run has none.
-
-    It combines the interval of this run with the spread between runs, observed or typical
-    (`Parameter.spread`), as independent errors. The spread applies to both runs: their difference is larger
-    by the root of two than the deviation of one run from the ground's mean. It is cut at the search bounds.
-    """
-    value, low, high = number.value, number.low, number.high
-    if not math.isfinite(high - low):
-        return Interval()
-    change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
-    below, above = math.hypot(value - low, change), math.hypot(high - value, change)
-    return Interval(*map(round_digits, cut_interval(value - below, value + above, parameter.bounds)))
 
 
 def read_clock(effect: Effect, run: MotionRun) -> dict[str, Number]:

@@ -12,6 +12,7 @@ import math
 import operator
 import pkgutil
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any, TypeAlias
 
 from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
 from pipeline.models import (
+    LEAST_DELAY_S,
     UNDECIDED,
     Effect,
     FormulaEffect,
@@ -27,6 +29,8 @@ from pipeline.models import (
     Number,
     Parameter,
     Quantity,
+    expect_another_run,
+    is_of_one_run,
     is_own,
 )
 from pipeline.run import MotionError
@@ -257,6 +261,8 @@ def require_plausible(label: str, *values: float, least: float = -LARGEST) -> No
 _FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
 _MOST_GROUNDS = 5
 """Values by ground that a comment lists; of more it has the least and the largest."""
+_LINE = 100
+"""Columns of a line of names in a comment."""
 _LEAST_FACTOR = 0.01
 """Least ratio of an effective to a nominal length: below it a vehicle hardly moves, and has no parameters."""
 
@@ -356,22 +362,33 @@ class ParameterTable:
     Attributes:
         head: comment lines above them.
         settings: the parameters.
+        unknown: names of the parameters that no effect of the model tells.
     """
 
     head: list[str] = field(default_factory=list)
     settings: list[Setting] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
 
     def add(self, path: str, amount: Amount, note: str = "") -> None:
-        """Add a value unless it is unknown."""
+        """Add a value; of an unknown one only that it is."""
         if amount.is_known:
             self._append(path, _round(amount.value), amount, note)
+        else:
+            self._miss(path)
 
     def add_row(self, path: str, amounts: tuple[Amount | float, ...], note: str = "") -> None:
-        """Add a parameter of several values, unless one that is not a constant is unknown."""
+        """Add a parameter of several values; if one that is no constant is unknown, only that it is."""
         measured = [amount for amount in amounts if isinstance(amount, Amount)]
         if all(amount.is_known for amount in measured):
             numbers = tuple(_round(a.value if isinstance(a, Amount) else a) for a in amounts)
             self._append(path, numbers, combine(lambda *_: math.nan, *measured), note)
+        else:
+            self._miss(path)
+
+    def _miss(self, path: str) -> None:
+        self.unknown.append(
+            ".".join(part for part in path.split(".")[1:] if part != "ros__parameters") or path
+        )
 
     def _append(self, path: str, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
         require_plausible(path, *(value if isinstance(value, tuple) else (value,)))
@@ -528,7 +545,7 @@ class Facts:
         return self._turn(self.find_deadband_speed())
 
     def list_unmapped(self, table: ParameterTable) -> list[str]:
-        """Parameters of effects that a table does not cover, one line for each effect."""
+        """Parameters of effects that a table does not cover, a line an effect, and clocks of poses."""
         used = {(name, source) for one in table.settings for source in one.sources for name in one.effects}
         lines = []
         for effect in self.file.model:
@@ -536,6 +553,12 @@ class Facts:
             missing = [text for text in texts if (effect.id, text) not in used]
             if missing or not texts:
                 lines.append("; ".join(missing) or effect.id)
+        clocks = {str(row.get("run")): row.get("pose_delay_s") for row in self.file.list_fitted("runs")}
+        lines += [
+            f"clock_offset.d = {late:.3g} s: the poses of {quote_name(run)} are late"
+            for run, late in clocks.items()
+            if isinstance(late, float) and abs(late) >= LEAST_DELAY_S
+        ]
         return lines
 
     def list_driven(self, key: str) -> list[float]:
@@ -568,7 +591,12 @@ class Facts:
         label, number = f"{effect.id}.{parameter.name}", self.file.find_number(effect, parameter)
         text = f"{label} = {number.value:.5g}{suffix_unit(number.unit)}"
         if math.isfinite(number.low):
-            text += f" (95 %: {number.low:.5g} to {number.high:.5g})"
+            single = len(self.file.list_fitted("runs")) == 1
+            text += f" ({'this run' if single else 'these runs'}, 95 %: {number.low:.5g} to {number.high:.5g}"
+            if parameter.between_runs is not None and not is_of_one_run(effect.parameters):
+                there = expect_another_run(parameter, number)
+                text += f"; another run: {there.low:.3g} to {there.high:.3g}"
+            text += ")"
         if by_ground := self._list_by_ground(label):
             text += f", the mean of {', '.join(by_ground)}"
         if number.doubt == UNDECIDED:
@@ -619,10 +647,13 @@ def _take_least(*amounts: Amount) -> Amount:
 
 
 def list_comments(facts: Facts, table: ParameterTable) -> list[str]:
-    """Comment lines above the parameters: the head, and the effects that none of them covers."""
-    unmapped = facts.list_unmapped(table)
+    """Comment lines above the parameters: the head, effects that none of them covers, and what is missing."""
+    unmapped, unknown = facts.list_unmapped(table), ", ".join(table.unknown)
     lines = [*table.head, *(["Not covered by these parameters:"] if unmapped else [])]
-    return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
+    lines += [f"  {line}" for line in unmapped]
+    lines += ["Not written, as no effect of the model determines it:"] if unknown else []
+    lines += [f"  {line}" for line in textwrap.wrap(unknown, _LINE)]
+    return [make_plain(line) for line in lines]
 
 
 def write_yaml(facts: Facts, table: ParameterTable) -> str:

@@ -46,11 +46,13 @@ class Response(NamedTuple):
         speeds: commanded speeds [m/s], shape (n,).
         linear: speed over its command when driving straight, shape (n,).
         angular: yaw rate over its command at these speeds, shape (n,).
+        turn: the commanded yaw rate [rad/s].
     """
 
     speeds: Floats
     linear: Floats
     angular: Floats
+    turn: float
 
     @property
     def separation(self) -> Floats:
@@ -71,7 +73,7 @@ def find_response(facts: Facts) -> Response:
     speeds = [float(f"{top * (n + 1) / _SPEEDS:.3g}") for n in range(_SPEEDS)]
     straight = [find_steady_motion(vehicle, effects, speed, 0.0)[0] for speed in speeds]
     curved = [find_steady_motion(vehicle, effects, speed, turn)[1] for speed in speeds]
-    return Response(np.array(speeds), np.array(straight) / speeds, np.array(curved) / turn)
+    return Response(np.array(speeds), np.array(straight) / speeds, np.array(curved) / turn, turn)
 
 
 def describe_spread(facts: Facts) -> list[str]:
@@ -90,4 +92,9 @@ def describe_spread(facts: Facts) -> list[str]:
                 for value, speed in zip(values.tolist(), response.speeds.tolist(), strict=True)
             )
             lines.append(f"One {name} does not fit all speeds: {at}.")
+    if lines:
+        at = f"at a yaw rate of {response.turn:.3g} rad/s"
+        lines.append(
+            f"These are of all effects together, {at}; each value below is of the effects beside it."
+        )
     return lines

@@ -99,6 +99,7 @@ else:
                 "DOUBTS",
                 "Interval",
                 "Number",
+                "expect_another_run",
                 "split_determined",
             ),
             "parameter": (

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 from msgspec.structs import replace
 
-from pipeline.core import JSON_DIGITS, count_places, round_numbers
-from pipeline.models.parameter import stands_at_bound
+from pipeline.core import JSON_DIGITS, NORMAL_95, count_places, round_digits, round_numbers
+from pipeline.models.parameter import cut_interval, stands_at_bound
 
 if TYPE_CHECKING:
     from pipeline.models.parameter import Parameter
@@ -29,7 +29,7 @@ DOUBTS = {
     ONE_LIMIT: ("undetermined", "undetermined: its interval reaches a limit of the search"),
     UNDECIDED: ("undecided", "undecided: another effect would explain the data as well"),
     TOO_SHORT: ("run too short", "the driving is too short for certainty"),
-    FEW_STRETCHES: ("read from {} stretches", "read from {} of the driven stretches of 20 s only"),
+    FEW_STRETCHES: ("few stretches: {}", "only {} of the driven stretches of 20 s tell it"),
 }
 """Of each doubt about a number: its mark beside a value, and the reason."""
 
@@ -126,3 +126,18 @@ def split_determined(numbers: Mapping[str, Number]) -> tuple[dict[str, Number], 
     """Values that the runs determine, and those that they leave open or that are at a bound."""
     known = {name: value for name, value in numbers.items() if not value.is_undetermined}
     return known, {name: value for name, value in numbers.items() if name not in known}
+
+
+def expect_another_run(parameter: Parameter, number: Number) -> Interval:
+    """95 % interval of a number in another run on the same ground, NaN where this run has none.
+
+    It combines the interval of this run with the spread between runs, observed or typical
+    (`Parameter.spread`), as independent errors. The spread applies to both runs: their difference is larger
+    by the root of two than the deviation of one run from the ground's mean. It is cut at the search bounds.
+    """
+    value, low, high = number.value, number.low, number.high
+    if not math.isfinite(high - low):
+        return Interval()
+    change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
+    below, above = math.hypot(value - low, change), math.hypot(high - value, change)
+    return Interval(*map(round_digits, cut_interval(value - below, value + above, parameter.bounds)))

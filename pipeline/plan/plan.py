@@ -61,6 +61,9 @@ _MOST_ROUNDS = 8
 # Shares of the largest speed that are tried until the drive stays inside the area.
 _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
 
+_TIMES_S = (60.0, 120.0, 180.0, 300.0, 600.0, 900.0, 1200.0, 1800.0, 2700.0, LONGEST_S)
+"""Times of a drive that are named where another one is too short [s]."""
+
 SAFETY = (
     "This drives a real robot in open loop: no obstacle and no error stops it.",
     "Play it with the wheels lifted first. Then clear the area, and keep an emergency stop at hand.",
@@ -98,6 +101,7 @@ class Question:
         at_most: half-width that 19 of 20 drives reach, as the spread of few blocks scatters; 0 for a t.
         decided_after_s: time in the drive from which it is decided; infinite if it is not.
         needs: what would decide it where this drive adds nothing.
+        longer_s: time for all manoeuvres alike in which it is decided, of round times; infinite for none.
     """
 
     question: str
@@ -112,6 +116,7 @@ class Question:
     at_most: float = 0.0
     decided_after_s: float = math.inf
     needs: str = ""
+    longer_s: float = math.inf
 
     @property
     def informs(self) -> bool:
@@ -142,6 +147,8 @@ class Plan:
         steered: whether a turn is a steering angle.
         ways: paths of the known model, first, and of those with one effect more, positions x + iy [m] at
             20 Hz, shape (models, n).
+        roomier: how many questions the best drive at the largest speed decides, and the length and width of
+            the area that it takes [m], where that is larger; else None.
     """
 
     vehicle: str
@@ -155,6 +162,7 @@ class Plan:
     type_name: str
     steered: bool
     ways: Complex = field(repr=False)
+    roomier: tuple[int, float, float] | None = None
 
     @property
     def informative(self) -> tuple[Question, ...]:
@@ -181,6 +189,12 @@ class Plan:
             )
         if narrowed := len(self.informative) - len(decided):
             parts.append(f"narrows {narrowed}")
+        late = [one.longer_s for one in self.questions if not one.informs and one.longer_s < math.inf]
+        if late:
+            parts.append(f"--time {_format_minutes(max(late))} would decide {len(late)} more")
+        if self.roomier is not None and self.roomier[0] > len(decided):
+            count, length, width = self.roomier
+            parts.append(f"--area {length:.0f}x{width:.0f}m would decide {count}")
         return "; ".join(parts)
 
     def list_rows(self) -> list[Row]:
@@ -198,7 +212,7 @@ class Plan:
                 rows.append((one.name, f"{one.value:.3g} ±{format_digits(one.now)}{unit}", text))
         seen = [one for one in self.informative if one.kind == "presence"]
         if seen:
-            after = f"seen after {format_duration(seen[-1].decided_after_s)}, if acting"
+            after = f"would show after {format_duration(seen[-1].decided_after_s)}"
             rows.append((name_first([one.name for one in seen]), "not seen", after))
         rest = [one for one in self.questions if not one.informs]
         for needs in dict.fromkeys(one.needs for one in rest):
@@ -306,6 +320,7 @@ def make_plan(
         PlanError: ``no_room``, no manoeuvre fits into the area.
     """
     best: Plan | None = None
+    roomier: tuple[int, float, float] | None = None
     for scale in _SCALES:
         notify(f"manoeuvres at {format_share(scale)} of the largest speed")
         library = list_manoeuvres(studied.vehicle, limits, scale)
@@ -335,6 +350,11 @@ def make_plan(
             starts = LEAD_S + np.cumsum([0.0, *seconds[[*chosen]]])
             driven = Rehearsal(commands, studied, starts)
             ways = np.array([driven.trace(effects)[0] for effects in models])
+            if roomier is None:
+                sides = [
+                    2.0 * float(np.ceil(area.margin_m + np.abs(one).max())) for one in (ways.real, ways.imag)
+                ]
+                roomier = (sum(one.decided_after_s < math.inf for one in answers), sides[0], sides[1])
             if not chosen or area.holds(ways):
                 break
             chosen = chosen[:-1]
@@ -349,6 +369,7 @@ def make_plan(
             *played,
             is_steered(studied.vehicle),
             ways,
+            None if area.length_m >= roomier[1] and area.width_m >= roomier[2] else roomier,
         )
         if best is None or len(made.decided) > len(best.decided):
             best = made
@@ -450,6 +471,10 @@ def _choose(
     return chosen
 
 
+def _format_minutes(seconds: float) -> str:
+    return f"{seconds / 60.0:g}min"
+
+
 def _foretell(
     assessment: Assessment, questions: Sequence[Question], seconds: Floats, chosen: Sequence[int]
 ) -> list[Question]:
@@ -464,8 +489,10 @@ def _foretell(
                 after = round(LEAD_S + float(seconds[[*chosen[:count]]].sum()), 3)
                 break
         counts = np.bincount(np.array(chosen, np.int64), minlength=seconds.size).astype(np.float64)
-        is_slow = assessment.expect(one, every)[1] >= 1.0
-        needs = "give more --time" if is_slow else suggest_drive(*one.effects)
+        enough = (time for time in _TIMES_S if assessment.expect(one, every * (time / LONGEST_S))[1] >= 1.0)
+        longer = next(enough, math.inf)
+        is_late = longer < math.inf
+        needs = f"give --time {_format_minutes(longer)}" if is_late else suggest_drive(*one.effects)
         expected = assessment.expect(one, counts)[0]
-        answers.append(replace(expected, decided_after_s=after, needs=needs))
+        answers.append(replace(expected, decided_after_s=after, needs=needs, longer_s=longer))
     return sorted(answers, key=lambda one: one.decided_after_s)

@@ -67,6 +67,8 @@ _LITERAL = re.compile(r"(`[^`]+`|(?<![\w-])--[a-z][a-z-]*)")
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
+_ROUND_NS, _NEAR_NS = 10**17, 10**9
+"""A start within a second after a multiple of 1e8 s, as 1.7e9 s, is that of a converter [ns]."""
 _MINUS = re.compile(r"(?<![\w.)\]-])-(?=\.?\d)")
 """Hyphen in front of a number."""
 _LABEL_LENGTH = 40
@@ -138,7 +140,7 @@ def format_split(drivetrain: float, ground: float, cross: float) -> str:
     """
     if max(drivetrain, ground) <= 1.0:
         parts = {"drivetrain": drivetrain, "ground": ground}
-        parts["where they cancel" if cross < 0.0 else "where they add up"] = cross
+        parts["cancelling each other" if cross < 0.0 else "acting together"] = cross
         return ", ".join(f"{name} {format_share(share, 0)}" for name, share in parts.items()).replace(
             "-", "\u2212"
         )
@@ -163,7 +165,8 @@ def count_serious(findings: Iterable[Finding]) -> dict[str, str]:
 def format_date(run: str, nanoseconds: int | None) -> str:
     """Start of a run: date and time (UTC) of its first stamp; empty if the clock was never set.
 
-    Where a date in the name contradicts the clock, that date counts, as everywhere.
+    Where a date in the name contradicts the clock, that date counts, as everywhere. A start at a round epoch,
+    as 1.7e9 s, is one that a converter set.
     """
     dates = date_runs({run: nanoseconds})
     if dates.notes or nanoseconds is None:
@@ -172,7 +175,8 @@ def format_date(run: str, nanoseconds: int | None) -> str:
         day = datetime.fromtimestamp(nanoseconds / 1e9, UTC)
     except (OverflowError, OSError, ValueError):
         return ""
-    return day.strftime("%Y-%m-%d %H:%M UTC") if day.year >= _EARLIEST_YEAR else ""
+    is_set = day.year >= _EARLIEST_YEAR and nanoseconds % _ROUND_NS >= _NEAR_NS
+    return day.strftime("%Y-%m-%d %H:%M UTC") if is_set else ""
 
 
 # HTML from the templates beside the code; all texts are escaped.

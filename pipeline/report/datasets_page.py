@@ -1,9 +1,11 @@
 """Pages of what sets runs side by side: comparison, causes, fleet, trend, map, check."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, FigureFormat, format_count, format_csv
@@ -11,6 +13,8 @@ from pipeline.datasets import (
     ABOUT_UNIT,
     AS_PUBLISHED,
     EQUAL_DRIVING,
+    OTHERS_SPREAD,
+    OVER_RUNS,
     QUANTITIES,
     THIS_RUN,
     Answer,
@@ -29,9 +33,7 @@ from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axi
 from pipeline.store import Store
 from pipeline.words import (
     Table,
-    describe_terrains,
     list_check_sentences,
-    list_series,
     list_shown_notes,
     list_sides,
     name_series,
@@ -47,6 +49,17 @@ from pipeline.words import (
 )
 
 _ROW = 34
+_LEAST = 1e-3
+"""Slip [m/s] below which a level is drawn at the end of its axis: no pose is so exact."""
+_TICKS = [float(f"{digit}e{power}") for power in range(-3, 3) for digit in (1, 2, 5)]
+_INTERVALS = {OVER_RUNS: theme.ON_COMMAND, OTHERS_SPREAD: theme.ON_MEASURED, THIS_RUN: theme.CROSS}
+"""Colours of intervals by what they are of."""
+_MAP, _COMPLEXITY = (720, 520), (0.0, 10.0)
+"""Width and height of the map [px], and the ends of the scale of terrains."""
+_RADIUS, _LETTER = {True: 7.5, False: 5.0}, {True: 7.0, False: 6.0}
+"""Of own marks and of others: radius, and width of a letter beside them [px]."""
+_WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
+"""Where a name may stand beside its mark, the best first."""
 _MOST_FIGURES = 40
 """Series of a page: those with a step come first."""
 
@@ -137,33 +150,36 @@ def _draw_levels(answer: Answer, view: tuple[str, str]) -> Picture | None:
         "run",
         pl.col(quantity).alias("value"),
     )
-    # Intervals of so few runs that they tell little of others would flatten the points.
-    end = 1.6 * float(points["value"].to_numpy().max())
-    kinds = ["95 % interval over runs", "of this run only"]
     spans = levels.select(
         pl.col("dataset").replace_strict(labels, return_dtype=pl.String).alias("label"),
         "value",
-        pl.col("low").clip(0.0, end),
-        pl.col("high").clip(0.0, end),
-        pl.when(pl.col("interval") == THIS_RUN)
-        .then(pl.lit(kinds[1]))
-        .otherwise(pl.lit(kinds[0]))
-        .alias("kind"),
+        "low",
+        "high",
+        pl.col("interval").alias("kind"),
+    )
+    # Intervals are ratios, and those of few runs are wide: on a logarithmic axis all of them are whole.
+    numbers = pl.concat([points["value"], *(spans[name] for name in ("value", "low", "high"))]).drop_nulls()
+    domain = [float(f"{end:.2g}") for end in (0.9 * max(numbers.min(), _LEAST), 1.1 * numbers.max())]
+    spans, points = (
+        frame.with_columns(pl.col(pl.Float64).clip(lower_bound=domain[0])) for frame in (spans, points)
     )
     name, words = f"{quantity}_{source}", INPUT_WORDS[source]
     title = f"{'slip modulus' if quantity == EQUAL_DRIVING else answer.measure} {words} [m/s]"
     order = list(labels.values())
     axis = {"title": None, "labelLimit": 280, "minExtent": 190, "grid": False, "labelColor": theme.INK}
     rows = encode_column("label:N", sort=order, axis=axis, scale={"domain": order})
-    colours = {"domain": kinds, "range": [theme.ON_COMMAND, theme.CROSS]}
+    kinds = [kind for kind in _INTERVALS if kind in set(spans["kind"])]
+    colours = {"domain": kinds, "range": [_INTERVALS[kind] for kind in kinds]}
+    legend = {"title": "95 % interval", "symbolType": "stroke"}
+    ticks = [tick for tick in _TICKS if domain[0] <= tick <= domain[1]]
     bars = (
         Chart.of_rows(f"{name}_spans")
         .mark("rule", strokeWidth=5, opacity=0.75)
         .encode(
             y=rows,
-            x=make_axis("low", title, scale={"domain": [0.0, end], "nice": True}, tickCount=5),
+            x=make_axis("low", title, scale={"type": "log", "domain": domain, "nice": False}, values=ticks),
             x2="high:Q",
-            color=encode_column("kind:N", scale=colours, legend={"title": None, "symbolType": "stroke"}),
+            color=encode_column("kind:N", scale=colours, legend=legend),
         )
     )
     middles = (
@@ -253,12 +269,15 @@ def write_fleet(store: Store, fleet: Fleet) -> dict[str, Path]:
 
 def write_trend(store: Store, trend: Trend) -> dict[str, Path]:
     """Write `trend.html`; the files by name."""
-    series = list_series(trend)
+    series = trend.series
     drawn = [one for one in series if one.points.height > 1][:_MOST_FIGURES]
     page = _build_page(
         "Trends",
         [f"{len(series)} series", format_count(len(trend.keys), "run")],
-        lines=[f"{name_series(one)} of {one.group}: {one.describe()}" for one in series if one.is_changed],
+        lines=[
+            trend.summary,
+            *(f"{name_series(one)} of {one.group}: {one.describe()}" for one in series if one.is_changed),
+        ],
         pictures=[_draw_series(one, f"trend_{number}") for number, one in enumerate(drawn)],
         tables=[tabulate_trend(trend)],
         notes=trend.notes,
@@ -319,11 +338,18 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
 
 def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
     """Kinetic energy against terrain complexity, own datasets as large points."""
+    energies = pl.concat([drawn.points["energy"], drawn.own["energy"]])
+    ends = (0.5 * energies.min(), 2.0 * energies.max()) if energies.len() else (1.0, 10.0)
     axes = {
         "x": make_axis(
-            "complexity", "terrain complexity (0 flat asphalt, 10 impassable)", (0.0, 10.0), tickCount=10
+            "complexity", "terrain complexity (0 flat asphalt, 10 impassable)", _COMPLEXITY, tickCount=10
         ),
-        "y": make_axis("energy", "largest kinetic energy [J]", scale={"type": "log"}, format="~s"),
+        "y": make_axis(
+            "energy",
+            "largest kinetic energy [J]",
+            scale={"type": "log", "domain": list(ends), "nice": False},
+            format="~s",
+        ),
     }
     literature = (
         Chart.of_rows("literature")
@@ -347,22 +373,57 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
             tooltip=["dataset:N", "runs:Q", "energy:Q", "value:Q"],
         )
     )
-    # Of datasets with nearly the same energy one name stands above its mark and the other below.
-    names = [
-        Chart.of_rows("own")
-        .filter(f"datum.side === {side}")
-        .mark("text", align="left", dx=9, dy=dy, fontWeight=600)
-        .encode(**axes, text="dataset:N")
-        for side, dy in ((0, -11), (1, 13))
-    ]
-    # Scales of no rows have no ends.
-    own = (marks, *names) if drawn.own.height else ()
-    chart = layer(literature, *own).properties(width=720, height=520)
-    note = "Hollow: mass, speed or terrain is not known well. Point at a mark to read what it is."
+    charts = [literature, *([marks] if drawn.own.height else [])]  # scales of no rows have no ends
+    names = _place_names(drawn, ends)
+    for is_own, weight in ((False, 400), (True, 600)):
+        rows = Chart.of_rows("names").filter(f"datum.own == {str(is_own).lower()}")
+        look = rows.mark("text", fontWeight=weight, **({} if is_own else {"color": theme.QUIET}))
+        charts.append(look.encode(**axes, text="name:N"))
+    chart = layer(*charts).properties(width=_MAP[0], height=_MAP[1])
+    note = (
+        "Hollow: mass, speed or terrain is not known well. Names that have no room are left out; point at a "
+        "mark to read what it is."
+    )
     words = f"{drawn.points.height} deployments of the literature and {drawn.own.height} own datasets."
-    sides = drawn.own.with_columns(side=pl.col("energy").rank("ordinal") % 2)
-    rows = {"literature": drawn.points, "own": sides}
-    return Picture("deployment_map", "Energy and terrain", Drawing(chart, rows, note, words))
+    tables = {"literature": drawn.points, "own": drawn.own, "names": names}
+    return Picture("deployment_map", "Energy and terrain", Drawing(chart, tables, note, words))
+
+
+def _place_names(drawn: DeploymentMap, ends: tuple[float, float]) -> pl.DataFrame:
+    """Names of marks where they cover neither a mark nor another name; those of own datasets come first.
+
+    Args:
+        drawn: the marks.
+        ends: of the axis of the energy [J].
+
+    Returns:
+        Rows with ``complexity``, ``energy`` of the middle of a ``name``, and whether it is ``own``. A name of
+        the literature for which there is no room is left out.
+    """
+    width, height = _MAP
+    per_unit = np.array([width / (_COMPLEXITY[1] - _COMPLEXITY[0]), height / math.log(ends[1] / ends[0])])
+    marks = [
+        (str(name), np.array([x, math.log(y / ends[0])]) * per_unit, is_own)
+        for frame, column, is_own in ((drawn.own, "dataset", True), (drawn.points, "key", False))
+        for name, x, y in frame.select(column, "complexity", "energy").iter_rows()
+    ]
+    taken = [(middle, np.full(2, _RADIUS[is_own])) for _, middle, is_own in marks]
+    rows = []
+    for name, middle, is_own in marks:
+        half = np.array([0.5 * _LETTER[is_own] * len(name), 7.0])
+        free = []
+        for step, way in itertools.product((1.0, 2.2), _WAYS):
+            place = middle + np.array(way) * (half + step * _RADIUS[is_own] + 2.0)
+            inside = bool((place - half >= 0.0).all() and (place + half <= np.array(_MAP)).all())
+            covered = sum(bool((np.abs(place - at) < half + size).all()) for at, size in taken)
+            free.append((covered if inside else math.inf, len(free), place))
+        covered, _, place = min(free, key=lambda one: one[:2])
+        if is_own or not covered:
+            taken.append((place, half))
+            x, y = (place / per_unit).tolist()
+            rows.append((x, ends[0] * math.exp(y), name, is_own))
+    kinds = {"complexity": pl.Float64, "energy": pl.Float64, "name": pl.String, "own": pl.Boolean}
+    return pl.DataFrame(rows, schema=kinds, orient="row")
 
 
 def render_check(check: RunsCheck) -> str:
@@ -374,6 +435,6 @@ def render_check(check: RunsCheck) -> str:
         lines=list_check_sentences(check),
         answer=limits if limits.rows else None,
         tables=[tabulate_check(check)],
-        notes=[*check.sides.notes, *filter(None, [describe_terrains(check)])],
+        notes=check.sides.notes,
         runs=[f"{run} ({label})" for label, runs in sides.items() for run in runs],
     ).render()

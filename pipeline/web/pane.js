@@ -474,7 +474,7 @@ export class Pane {
     const go = (by) => () => this.showStretch((place + by + count) % count);
     const button = (by, text, title) => h("button", { type: "button", class: by < 0 ? "stretch-back" : "stretch-on", title, "aria-label": title, disabled: count < 2, onclick: go(by) }, text);
     return h("div", { class: "stretch-said" },
-      h("span", {}, `${Math.round(from)} to ${Math.round(to)} s: ${place ? `number ${place + 1} of ${count} by error` : `the worst ${Math.round(to - from)} s${count > 1 ? ` of ${count} stretches` : ""}`}`),
+      h("span", {}, `${Math.round(from)} to ${Math.round(to)} s: ${place ? `number ${place + 1} of ${count} by error` : count > 1 ? `the worst of ${count} stretches by error` : "the worst stretch"}`),
       button(-1, "‹", "the stretch before it in the order of error"), button(1, "›", "the next stretch in the order of error"),
       this.cursorBar);
   }

@@ -27,7 +27,6 @@ else:
         {
             "check": (
                 "check_as_json",
-                "describe_terrains",
                 "format_junit",
                 "format_markdown",
                 "list_check_lines",
@@ -80,7 +79,6 @@ else:
                 "format_fleet",
                 "format_map",
                 "format_trend",
-                "list_series",
                 "name_series",
                 "summarize_map",
                 "tabulate_fleet",

@@ -5,6 +5,8 @@ import re
 from xml.etree import ElementTree as ET
 
 from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    STRETCH_S,
     enumerate_texts,
     format_angle,
     format_count,
@@ -13,7 +15,14 @@ from pipeline.core import (
     split_interval,
     suffix_unit,
 )
-from pipeline.datasets import CheckedNumber, RunsCheck
+from pipeline.datasets import (
+    COMMANDED_TURN,
+    HEADING_ERROR,
+    MULTIPLIER,
+    POSITION_ERROR,
+    CheckedNumber,
+    RunsCheck,
+)
 from pipeline.words.tables import Cell, Column, Table
 
 Line = tuple[str, str]
@@ -24,11 +33,23 @@ _HEAD = (
     Column("result", wide=True),
     Column("before -> after"),
     Column("difference [95 %]"),
-    Column("runs differ"),
+    Column("p"),
+    Column("spread"),
 )
+_ABOUT = "p: over all numbers of this check; spread: how much runs differ beyond their own errors"
+_ALONE = "intervals: of these recordings alone"
 _SPREAD_UNKNOWN = "how much runs of this robot differ without a change is not known"
-_FEWEST = 3
-"""Runs a side from which on they tell how much runs differ."""
+_OTHER_DRIVING = 1.25
+"""Ratio of the speeds of both sides from which on it is said that they were driven differently."""
+_FEW_STRETCHES = f"fewer than {FEWEST_OF_SPREAD} stretches of {STRETCH_S:g} s with a path of 2 s"
+_NO_TURNS = "no turns by body commands"
+_WHY_UNKNOWN = {
+    POSITION_ERROR: _FEW_STRETCHES,
+    HEADING_ERROR: _FEW_STRETCHES,
+    COMMANDED_TURN: _NO_TURNS,
+    MULTIPLIER: _NO_TURNS,
+}
+"""Reasons for which a number that every check has is unknown; of a parameter its runs do not determine it."""
 
 
 def format_check(check: RunsCheck) -> str:
@@ -38,11 +59,10 @@ def format_check(check: RunsCheck) -> str:
 
 def list_check_sentences(check: RunsCheck) -> list[str]:
     """The sentences of `format_check`, without capitals and periods."""
-    is_few = min(len(check.sides.before), len(check.sides.after)) < _FEWEST
-    unknown = f"{_SPREAD_UNKNOWN}{': three runs a side, or other runs, tell' * is_few}"
+    unknown = f"{_SPREAD_UNKNOWN}: {_say_what_tells(check)}"
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
-    sentences = list[str]()
+    sentences = _list_conditions(check)
     if check.is_single and known:
         pair = "a model and one run" if check.sides.is_model else "one run a side"
         apart = f"these recordings differ in {_list(differs)}, but " if differs else ""
@@ -56,8 +76,10 @@ def list_check_sentences(check: RunsCheck) -> list[str]:
     elif known:
         few = "" if check.is_compared else "; most parameters of the model cannot be compared"
         sentences.append(f"No change shown in {format_count(len(known), 'number')}{few}")
-        unclear = [one.title for one in check.list_status("unclear")]
-        sentences += [f"Too few runs to tell a change of {enumerate_texts(unclear)}"] if unclear else []
+        coarse = [one.title for one in check.list_status("not shown") if one.is_coarse]
+        sentences += [f"Too few runs to tell a change of {enumerate_texts(coarse)}"] if coarse else []
+        near = [one for one in check.list_status("not shown") if not one.is_coarse]
+        sentences += [f"Not shown beyond chance, but near: {_list(near)}"] if near else []
         sentences += [] if check.is_spread_known else [unknown]
     else:
         sentences.append("No conclusion: no number is known on both sides")
@@ -76,6 +98,36 @@ def list_check_sentences(check: RunsCheck) -> list[str]:
     return sentences
 
 
+def _list_conditions(check: RunsCheck) -> list[str]:
+    """What differed between the sides beside the robot: a change may be due to it."""
+    terrains = [" and ".join(one) for one in check.sides.terrains]
+    paces = check.sides.paces
+    sentences = []
+    if all(terrains) and terrains[0] != terrains[1]:
+        sentences.append(
+            f"The terrains differ, {terrains[0]} before and {terrains[1]} after: a change may be the ground's"
+        )
+    if max(paces) > _OTHER_DRIVING * min(paces):
+        sentences.append(
+            f"The driving differed, {paces[0]:.2g} m/s before and {paces[1]:.2g} m/s after "
+            "(root mean square, 1 rad/s as 1 m/s)"
+        )
+    return sentences
+
+
+def _say_what_tells(check: RunsCheck) -> str:
+    """How many more runs, and where, tell how much runs differ without a change."""
+    sides, grounds = check.sides, sorted({*check.sides.terrains[0], *check.sides.terrains[1]})
+    where = f" on {' or '.join(grounds)}" if grounds else ""
+    side = "AFTER" if sides.is_model else "BEFORE or AFTER"
+    told = (
+        f"{format_count(check.missing, 'more run')} {side}{where} {'tells' if check.missing == 1 else 'tell'}"
+    )
+    there = [f"{len(runs)} on {ground}" for ground, runs in sides.others.items()]
+    found = f"the results have {enumerate_texts(there) or 'none'}"
+    return told + (f", or {FEWEST_OF_SPREAD} other runs on one terrain ({found})" if grounds else "")
+
+
 def _list(numbers: list[CheckedNumber]) -> str:
     others = [f"{len(numbers) - _MOST} more"] if len(numbers) > _MOST else []
     return enumerate_texts([*map(describe_change, numbers[:_MOST]), *others])
@@ -89,8 +141,15 @@ def describe_change(number: CheckedNumber) -> str:
     text = f"{number.title} {_format(number, number.before)} -> {_format(number, number.after)}"
     if number.status != "changed":
         return text
-    p = f"p = {number.p_adjusted:.1g}" if number.p_adjusted >= 1e-4 else "p < 0.0001"  # noqa: PLR2004 - as many digits as are shown
-    return f"{text} ({p})"
+    p = _format_p(number)
+    return f"{text} (p {p if p.startswith('<') else f'= {p}'})"
+
+
+def _format_p(number: CheckedNumber) -> str:
+    """P over all numbers; empty where no runs tell how much runs differ."""
+    if not math.isfinite(number.spread):
+        return ""
+    return f"{number.p_adjusted:.1g}" if number.p_adjusted >= 1e-4 else "< 0.0001"  # noqa: PLR2004 - as many digits as are shown
 
 
 def _format(number: CheckedNumber, value: float) -> str:
@@ -106,18 +165,25 @@ def tabulate_check(check: RunsCheck) -> Table:
     rows: list[list[str | Cell]] = []
     for one in check.numbers:
         scale, unit = (100.0, " %") if one.is_ratio else (1.0, suffix_unit(one.unit))
-        difference, spread = "", ""
+        difference, spread = _explain_unknown(one), ""
         if one.is_known:
             value, low, high = split_interval(*(scale * part for part in (one.difference, one.low, one.high)))
             difference = f"{'' if value.startswith('-') else '+'}{value}{unit} [{low}, {high}]"
-            size = f"{scale * one.spread:.2g}{unit}" if one.spread else "by errors"
-            spread = size if math.isfinite(one.spread) else "not known"
+            spread = f"{scale * one.spread:.2g}{unit}" if math.isfinite(one.spread) else "not known"
         before, after = _format(one, one.before), _format(one, one.after)
         before = before.removesuffix(f" {after.partition(' ')[2]}")
         status = Cell(one.status, strong=one.status == "changed")
-        rows.append([one.title, status, f"{before} -> {after}", difference, spread])
-    note = "" if check.is_spread_known else "intervals: of these recordings alone"
+        rows.append([one.title, status, f"{before} -> {after}", difference, _format_p(one), spread])
+    note = _ABOUT if check.is_spread_known else _ALONE
     return Table("Numbers before and after", _HEAD, rows, note)
+
+
+def _explain_unknown(number: CheckedNumber) -> str:
+    """Where and why a number is unknown; empty if it is known."""
+    ends = (("before", number.before), ("after", number.after))
+    sides = [name for name, value in ends if not math.isfinite(value)]
+    why = _WHY_UNKNOWN.get(number.name, "the runs do not determine it")
+    return f"unknown {' and '.join(sides)}: {why}" if sides else ""
 
 
 def tabulate_limits(check: RunsCheck) -> Table:
@@ -137,13 +203,6 @@ def list_sides(check: RunsCheck) -> dict[str, list[str]]:
     return {label: [one.run for one in runs] for label, runs in groups.items() if runs}
 
 
-def describe_terrains(check: RunsCheck) -> str:
-    """That both sides were driven on different terrains; empty if they were not."""
-    before, after = (" and ".join(one) for one in check.sides.terrains)
-    is_known = before and after and before != after
-    return f"BEFORE was driven on {before}, AFTER on {after}" if is_known else ""
-
-
 def list_check_lines(check: RunsCheck) -> list[Line]:
     """The check as labels and texts: verdict, limits, the table, compared runs, notes."""
     lines = [("verdict", format_check(check))]
@@ -153,7 +212,6 @@ def list_check_lines(check: RunsCheck) -> list[Line]:
     lines += zip(labels, table.align(), strict=False)
     lines += [("", table.note)] if table.note else []
     lines += [(label, f"{len(runs)}: {', '.join(runs)}") for label, runs in list_sides(check).items()]
-    lines += [("terrains", text)] if (text := describe_terrains(check)) else []
     return lines + [("note", note) for note in check.sides.notes]
 
 
@@ -176,7 +234,7 @@ def format_junit(check: RunsCheck) -> str:
     If limits are given, changed numbers do not fail: the limits decide, as for the exit code.
     """
     kinds = {"broken": "failure", "undetermined": "skipped", "unknown": "skipped"}
-    kinds |= {"differs": "skipped", "unclear": "skipped"}
+    kinds |= {"differs": "skipped", "not shown": "skipped"}
     kinds |= {} if check.limits else {"changed": "failure"}
     cases: list[tuple[str, str, str, str]] = [
         ("limit", f"{one.name}: {one.limit}", one.outcome, f"{one.measured}, limit {one.limit}")

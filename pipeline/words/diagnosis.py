@@ -604,4 +604,7 @@ def _format_timed(alike: Sequence[Finding]) -> str:
     """Number of incidents of one kind, and the longest of them."""
     longest = max(alike, key=lambda one: (one.t_end or 0.0) - (one.t_start or 0.0))
     many = f"{len(alike)} incidents, the longest " if len(alike) > 1 else ""
-    return f"{many}from {longest.t_start:.1f} to {longest.t_end:.1f} s: {format_finding(longest)}"
+    start = longest.t_start or 0.0
+    # Some data begin before the first sample of all that the run needs, which is its zero.
+    when = f"from {start:.1f}" if start > 0.0 else "from the start"
+    return f"{many}{when} to {longest.t_end:.1f} s: {format_finding(longest)}"

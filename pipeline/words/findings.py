@@ -684,14 +684,14 @@ _LENGTHS = {"wheel_radius_m": "a wheel radius", "track_width_m": "a track", "whe
 def _wheels_alone(of: Values) -> str:
     taken = " and ".join(f"{_LENGTHS[key]} of {value:g} m" for key, value in of["assumed"].items())
     return (
-        "no vehicle is given and none is needed: commands and measurements are of the same wheels; lengths "
-        f"in metres are for {taken} ([vehicle] {', '.join(of['assumed'])} in run.toml: others)"
+        "no vehicle is given: commands and measurements are of the same wheels, and shares of slip need "
+        f"none; lengths in metres are for {taken} ([vehicle] {', '.join(of['assumed'])} in run.toml: others)"
     )
 
 
 def _body_alone(of: Values) -> str:
     text = (
-        "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
+        "no vehicle is given: commands and measurements of the drive are body motion, "
         "whose slip does not depend on wheel radius and track width"
     )
     if "track_m" in of:

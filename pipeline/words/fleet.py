@@ -5,7 +5,6 @@ from pipeline.datasets import Band, DeploymentMap, Fleet, Series, Trend
 from pipeline.models import name_number
 from pipeline.words.tables import NOTHING, Cell, Column, Table
 
-_SLIP = {"median_modulus": "median slip modulus", "median_window_norm": "slip over 2 s windows"}
 _MOST_NUMBERS = 8
 """Parameters of a vehicle on a screen of 24 lines, those of most runs first."""
 
@@ -24,7 +23,14 @@ def tabulate_fleet(fleet: Fleet, *, everything: bool = True) -> list[Table]:
         rows: list[list[str | Cell]] = []
         for one in shown:
             spreads = [_format(spread) for spread in (one.spread_terrain, one.spread_run)]
-            whole = [*_format_band(one.whole), suffix_unit(one.unit).strip(), one.level or "open"]
+            unit, level = suffix_unit(one.unit).strip(), one.level or "open"
+            whole = [*_format_band(one.whole), unit, level]
+            if one.disagreeing:
+                # A mean of values that disagree is a property of nothing.
+                ends = f"{one.disagreeing[0]:.3g} to {one.disagreeing[-1]:.3g}"
+                whole = [ends, NOTHING, NOTHING, unit, "runs disagree"]
+            elif one.level == "terrain":
+                whole[:2] = "by terrain", NOTHING
             rows.append(
                 [Cell(one.label, strong=True), *whole, str(one.whole.runs), *spreads, one.name, one.because]
             )
@@ -85,27 +91,37 @@ def name_series(series: Series) -> str:
     effect, _, parameter = series.quantity.partition(".")
     if parameter:
         return f"{name_number(effect, parameter)} ({series.quantity})"
-    name, _, source = series.quantity.removesuffix(")").partition(" (")
-    return f"{_SLIP[name]} {INPUT_WORDS[source]}"
+    source = series.quantity.removesuffix(")").partition(" (")[2]
+    return f"median slip modulus {INPUT_WORDS[source]}"
 
 
-def list_series(trend: Trend) -> list[Series]:
-    """The series that people read: window norms, which say what medians say, stay in the JSON."""
-    return [one for one in trend.series if not one.quantity.startswith("median_window")]
+def tabulate_trend(trend: Trend, *, everything: bool = True) -> Table:
+    """Each series with its latest value and its largest step.
 
-
-def tabulate_trend(trend: Trend) -> Table:
-    """Each series with its latest value and its largest step."""
+    Args:
+        trend: the series.
+        everything: also those that cannot be tested.
+    """
     rows: list[list[str | Cell]] = [
         [name_series(one), one.group, Cell(one.describe(), strong=one.is_changed)]
-        for one in list_series(trend)
+        for one in trend.series
+        if everything or one.step is not None
     ]
-    return Table("All series", (Column("quantity"), Column("of"), Column("course")), rows)
+    hidden = len(trend.series) - len(rows)
+    note = f"{hidden} more series without a test: --all, or the page" if hidden else ""
+    return Table("All series", (Column("quantity"), Column("of"), Column("course")), rows, note)
 
 
-def format_trend(trend: Trend) -> list[str]:
-    """Each series with its largest step, and notes."""
-    return [*tabulate_trend(trend).align(), *(f"! {note}" for note in trend.notes)]
+def format_trend(trend: Trend, *, everything: bool) -> list[str]:
+    """How many series could be tested, each with its largest step, and notes.
+
+    Args:
+        trend: the series.
+        everything: also those that cannot be tested.
+    """
+    table = tabulate_trend(trend, everything=everything)
+    notes = [f"! {note}" for note in trend.notes]
+    return [f"{trend.summary}.", *table.align(), *([table.note] if table.note else []), *notes]
 
 
 def tabulate_map(drawn: DeploymentMap) -> list[Table]:

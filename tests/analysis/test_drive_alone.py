@@ -210,7 +210,7 @@ def test_commands_of_the_wheels_themselves_need_no_geometry(tmp_path: Path, layo
     vehicle = "car" if layout == "ackermann" else "turtlebot3"
     log = record(make(layout, vehicle, {"drive_lag": 0.3}), tmp_path / "run.mcap")
     made = analyze(log, tmp_path / "results")
-    assert "no vehicle is given and none is needed" in made.findings["vehicle_fitted"]
+    assert "no vehicle is given: " in made.findings["vehicle_fitted"]
     assert made.manifest.part("vehicle")["stand_ins"]
     assert contains(made.named["drive_lag"]["tau"], 0.3)
 

@@ -108,7 +108,7 @@ def test_every_target_lists_what_it_leaves_out() -> None:
         assert list_omitted(file, target.name) == ({} if target.takes_doubtful else file.list_doubtful()), (
             target.name
         )
-    assert "read from 3 of the driven stretches" in export_model(file, "python")
+    assert "only 3 of the driven stretches of 20 s tell it" in export_model(file, "python")
 
 
 def test_a_value_that_somebody_fixes_is_theirs() -> None:

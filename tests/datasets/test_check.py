@@ -20,7 +20,7 @@ from pipeline.datasets.check import (
     compare_sides,
     read_limits,
 )
-from pipeline.datasets.check_readings import MULTIPLIER, POSITION_ERROR, RunReading
+from pipeline.datasets.check_readings import COMMANDED_TURN, MULTIPLIER, POSITION_ERROR, RunReading
 from pipeline.datasets.check_sides import Sides, read_under, unite_effects
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect
@@ -134,6 +134,61 @@ def test_one_run_a_side_cannot_tell_on_any_face_and_shows_the_table(same: Sides,
         assert all(any(title in text for _, text in list_check_lines(found)) for title in titles)
         # A probability of a change needs to know how much runs differ.
         assert not any("p <" in face or "p =" in face for face in faces)
+
+
+def test_what_its_interval_or_its_width_leaves_open_is_not_called_unchanged(same: Sides) -> None:
+    known = {"p": 0.016, "p_adjusted": 0.137, "spread": 0.1, "freedom": 4.0, "before": 0.23, "after": 0.35}
+    blank = CheckedNumber(COMMANDED_TURN, "share of asked yaw rate", "1", is_ratio=True, size=0.25)
+    for low, high, smallest, status in (
+        (0.08, 1.04, 0.2, "not shown"),
+        (-0.1, 0.2, 0.6, "not shown"),
+        (-0.1, 0.2, 0.2, "unchanged"),
+    ):
+        number = replace(blank, difference=0.5 * (low + high), low=low, high=high, smallest=smallest, **known)
+        assert number.status == status
+        found = RunsCheck(same, (number,))
+        (row,) = (line for line in list_check_lines(found) if line[0] == status)
+        assert re.search(r"\] +0\.1 ", row[1]), "the p over all numbers stands beside the word"
+    single = replace(blank, difference=0.5, low=0.08, high=1.04, smallest=0.2, **known)
+    assert "Not shown beyond chance, but near: share of asked yaw rate 0.23 -> 0.35" in format_check(
+        RunsCheck(same, (single,))
+    )
+
+
+def test_other_terrains_and_other_driving_are_said_first(late: Sides) -> None:
+    ice = tuple(replace(one, terrain="ice", pace=2.0 * one.pace) for one in late.after)
+    sentences = format_check(compare_sides(replace(late, after=ice))).split(". ")
+    assert sentences[0].startswith("The terrains differ, grass before and ice after")
+    assert sentences[1].startswith("The driving differed, ")
+    assert any(one.startswith("Changed: lag of the drive") for one in sentences)
+    assert "differ" not in format_check(compare_sides(late))
+
+
+def test_what_is_unknown_says_on_which_side_and_why(late: Sides) -> None:
+    def hide(reading: RunReading, *names: str) -> RunReading:
+        return replace(reading, estimates={k: v for k, v in reading.estimates.items() if k not in names})
+
+    blind = replace(
+        late,
+        before=tuple(hide(one, POSITION_ERROR) for one in late.before),
+        after=tuple(hide(one, POSITION_ERROR, LAG) for one in late.after),
+    )
+    rows = " ".join(text for label, text in list_check_lines(compare_sides(blind)) if label == "unknown")
+    assert "unknown before and after: fewer than 3 stretches of 10 s" in rows
+    assert "unknown after: the runs do not determine it" in rows
+
+
+def test_one_run_a_side_says_how_many_more_would_tell_and_on_which_ground(late: Sides) -> None:
+    one = replace(late, before=late.before[:1], after=late.after[:1])
+    said = format_check(compare_sides(one))
+    assert "2 more runs BEFORE or AFTER on grass tell" in said
+    assert "or 3 other runs on one terrain (the results have none)" in said
+    other = replace(one, others={"grass": late.before[1:2]})
+    assert "(the results have 1 on grass)" in format_check(compare_sides(other))
+    assert compare_sides(other).code == UNDETERMINED
+    # As many more as it says do tell.
+    more = replace(one, before=late.before[:3])
+    assert compare_sides(more).is_spread_known
 
 
 def test_a_screen_has_one_probability_a_row_and_only_of_what_changed(late: Sides) -> None:

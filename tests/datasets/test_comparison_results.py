@@ -13,7 +13,7 @@ from pipeline.datasets.compare import Answer, compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pairs import Group, SlipSamples, compare_groups
-from pipeline.report.datasets_page import write_answer
+from pipeline.report.datasets_page import _draw_levels, write_answer
 from pipeline.store import Store
 
 TERRAINS = {"asphalt": 0.5, "gravel": 1.0, "ice": 2.0}
@@ -63,6 +63,27 @@ def test_five_runs_a_side_tell_terrains_apart(store: Store) -> None:
     for row in rows.iter_rows(named=True):
         assert row["low"] < row["median_modulus"] < row["high"]
         assert f"{row['terrain']}_0/k0" in row["keys"]
+
+
+def test_the_figure_shows_whole_intervals_and_says_of_what_they_are(store: Store) -> None:
+    fill(store, {"asphalt": 0.5, "gravel": 1.0}, runs=2)
+    write_run(store, Run(name="only", dataset="warthog_ice", terrain="ice", median=2.0))
+    answer = ask(store)
+    levels = answer.take(answer.levels, answer.views[0])
+    said = dict(levels.select("dataset", "interval").iter_rows())
+    assert said == {
+        "warthog_asphalt": "over runs",
+        "warthog_gravel": "over runs",
+        "warthog_ice": "one run, spread of the others",
+    }
+    picture = _draw_levels(answer, answer.views[0])
+    assert picture is not None
+    spans = picture.drawing.rows[f"{picture.id}_spans"]
+    assert spans["low"].to_list() == levels.sort("value")["low"].to_list(), "no end is cut"
+    assert spans["high"].to_list() == levels.sort("value")["high"].to_list()
+    (low, high) = picture.drawing.chart["layer"][0]["encoding"]["x"]["scale"]["domain"]
+    assert low <= spans["low"].min()
+    assert spans["high"].max() <= high
 
 
 def test_equal_runs_are_not_told_apart_where_plain_samples_are(store: Store) -> None:

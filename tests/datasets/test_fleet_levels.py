@@ -1,5 +1,6 @@
 """Numbers of a fleet by level: the vehicle's, the ground's, a run's own, or open."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from pipeline.datasets.fleet import FleetNumber, expect_numbers, fit_fleet, fit_
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.trend import follow_trend
 from pipeline.store import Store
+from pipeline.words.fleet import format_fleet
 
 ERROR = 0.02
 ICE_AND_OTHERS = {"asphalt": 1.0, "gravel": 0.98, "ice": 0.7}
@@ -194,6 +196,30 @@ def test_numbers_of_the_controller_are_the_vehicles_and_friction_is_the_grounds(
     assert mud["wheel_servo.scrub"][1] > 1.2 * gravel["wheel_servo.scrub"][1]
     (tau,) = (one for one in fit_fleet(servo).numbers if one.parameter == "tau")
     assert (tau.level, tau.because) == ("vehicle", "by its nature the vehicle's")
+
+
+def test_runs_that_disagree_are_said_to_and_their_mean_is_no_property_of_the_vehicle() -> None:
+    limit = {"effect": "body_turn_limit", "parameter": "limit", "unit": "rad/s", "spread": 0.0, "runs": 1}
+    apart = fit_one(draw({"asphalt": 1.99, "ice": 0.985}, **limit))
+    assert (apart.level, apart.disagreeing) == (None, pytest.approx((0.985, 1.99), abs=0.1))
+    assert apart.because.startswith("runs disagree by more than 0.")
+    assert "warthog_ice_0 0.9" in apart.because
+    near = fit_one(draw({"asphalt": 1.0, "ice": 0.985}, **limit))
+    assert (near.level, near.disagreeing) == ("vehicle", ())
+
+    fleet = fit_fleet(draw({"asphalt": 1.99, "ice": 0.985}, **limit))
+    assert "1 on which runs disagree" in fleet.summary
+    assert "of the vehicle" not in fleet.summary
+    (row,) = (line for line in format_fleet(fleet, everything=False) if line.startswith("body_turn_limit"))
+    assert row.endswith("runs disagree")
+    assert not re.search(r"\b1\.[45]", row), "no mean of what disagrees"
+
+
+def test_a_number_of_one_run_is_no_property_of_the_vehicle() -> None:
+    limit = {"effect": "body_turn_limit", "parameter": "limit", "unit": "rad/s", "runs": 1}
+    alone = fit_one(draw({"asphalt": 1.0}, **limit))
+    assert alone.level is None
+    assert alone.because.startswith("only one run determines it")
 
 
 def test_poses_that_gyros_have_dated_are_no_body_that_is_late() -> None:

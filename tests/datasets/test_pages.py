@@ -1,8 +1,12 @@
 """Pages over all runs lead to each other and to what is there."""
 
+import itertools
+import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
+import polars as pl
 from comparison_store import Run, write_run
 
 from pipeline.analysis.analyze import update_datasets
@@ -10,7 +14,7 @@ from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.datasets.deployments import draw_up_map
 from pipeline.datasets.trend import follow_trend
 from pipeline.report import lead_to
-from pipeline.report.datasets_page import write_map, write_trend
+from pipeline.report.datasets_page import _place_names, write_map, write_trend
 from pipeline.store import Store, see_log
 
 
@@ -50,6 +54,29 @@ def test_every_page_links_those_that_are_there_and_all_that_came_since(tmp_path:
         assert all((tmp_path / link).is_file() for link in links_of(tmp_path / page))
     update_datasets(store)
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
+
+
+def test_names_on_the_map_cover_no_mark_and_no_other_name() -> None:
+    places = {"ice": (6.0, 3121.0), "sand": (6.67, 3542.0), "snow": (6.1, 3300.0), "grass": (4.9, 612.0)}
+    own = pl.DataFrame(
+        [(f"warthog_{name}", *place) for name, place in places.items()],
+        schema=["dataset", "complexity", "energy"],
+        orient="row",
+    )
+    points = own.select(pl.lit("Someone2024").alias("key"), "complexity", pl.col("energy") * 1.01)
+    drawn = SimpleNamespace(own=own, points=points)
+    names = _place_names(drawn, (10.0, 100_000.0))  # type: ignore[arg-type]
+    assert set(names.filter("own")["name"]) == set(own["dataset"]), "every own dataset has its name"
+    assert "Someone2024" in set(names["name"])
+
+    def put(row: dict[str, float]) -> tuple[float, float]:
+        return row["complexity"] * 72.0, 520.0 * math.log(row["energy"] / 10.0) / math.log(10_000.0)
+
+    boxes = [(*put(row), 3.0 * len(row["name"]), 6.0) for row in names.iter_rows(named=True)]
+    dots = [(*put(row), 5.0, 5.0) for row in own.iter_rows(named=True)]
+    for a, b in itertools.combinations([*boxes, *dots], 2):
+        apart = abs(a[0] - b[0]) >= a[2] + b[2] or abs(a[1] - b[1]) >= a[3] + b[3]
+        assert apart or (a in dots and b in dots), (a, b)
 
 
 def test_a_page_elsewhere_leads_to_the_catalogue_that_is_there(tmp_path: Path) -> None:

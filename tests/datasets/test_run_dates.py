@@ -100,4 +100,5 @@ def test_the_table_of_runs_the_list_of_runs_and_a_report_have_the_dates_of_the_t
     compared = find_material(store, ["vehicle"], trusted_only=False, tables=("estimates",))
     assert compared.labels.select("run", "day").rows() == [("moss", None)]
     assert format_date("ice_2024_7_30", PLACEHOLDER) == "2024-07-30"
-    assert format_date("ice_2023_11_15", PLACEHOLDER) == "2023-11-14 22:13 UTC"
+    assert format_date("ice_2023_11_15", PLACEHOLDER + 60 * 10**9) == "2023-11-14 22:14 UTC"
+    assert format_date("ice", PLACEHOLDER) == "", "no clock of a robot starts at a round epoch"

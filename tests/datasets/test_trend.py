@@ -13,9 +13,10 @@ from verbs import ask_verb
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.trend import Series, find_steps, follow_trend
+from pipeline.datasets.trend import Series, Trend, find_steps, follow_trend
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
+from pipeline.words.fleet import format_trend
 
 FIRST = date(2026, 4, 20)
 WOBBLE = (0.01, -0.02, 0.015, -0.01, 0.02, -0.015, 0.0)
@@ -54,9 +55,14 @@ def test_a_track_that_moved_is_told_with_its_day(tmp_path: Path) -> None:
     assert (first["step"]["before"], first["step"]["after"]) == pytest.approx((1.8, 2.1), abs=0.01)
     assert {one["quantity"] for one in content["series"]} >= {
         "median_modulus (command)",
-        "median_window_norm (measured)",
+        "median_modulus (measured)",
     }
-    assert "1.8 -&gt; 2.1 since 2026-05-03" in Path(content["page"]).read_text(encoding="utf-8")
+    page = Path(content["page"]).read_text(encoding="utf-8")
+    assert "1.8 -&gt; 2.1 since 2026-05-03" in page
+    # Page, screen and JSON have the same series.
+    assert f"{len(content['series'])} series" in page
+    assert all(one["step"]["is_significant"] for one in content["series"])
+    assert "3 significant steps in 3 of 3 series that could be tested" in page
 
 
 def test_a_step_is_found_across_grounds_and_another_ground_is_none() -> None:
@@ -81,7 +87,16 @@ def test_a_step_is_found_across_grounds_and_another_ground_is_none() -> None:
 def test_few_runs_are_not_tested_and_chance_makes_few_steps() -> None:
     (few,) = find_steps([make_series([1.0, 1.1, 2.0, 2.1, 2.0], ["ice"] * 5)])
     assert few.step is None
-    assert "too few for a test" in few.describe()
+    assert "no test: 5 of the 6 runs on terrains driven twice that it takes" in few.describe()
+    (alone,) = find_steps([make_series([1.0, 1.1, 2.0, 2.1, 2.0, 2.1, 2.2], [f"g{i}" for i in range(7)])])
+    assert "7 runs" in alone.describe()
+    assert "no test: 0 of the 6 runs on terrains driven twice" in alone.describe()
+    trend = Trend((few, alone), (), ())
+    assert trend.summary.startswith("Nothing can be tested: a series takes 6 dated runs")
+    screen = format_trend(trend, everything=False)
+    assert not any("latest" in line for line in screen)
+    assert "2 more series without a test: --all, or the page" in screen
+    assert sum("latest" in line for line in format_trend(trend, everything=True)) == len(trend.series)
     rng = np.random.default_rng(9)
     wrong = 0
     for _ in range(40):

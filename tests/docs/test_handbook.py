@@ -152,6 +152,9 @@ def test_the_readme_answers_first_and_is_short() -> None:
     [
         ("k = 1.80 [1.78, 1.82]", "k = 1.81 [1.78, 1.82]", False),
         ("k = 1.80 [1.78, 1.82]", "k = 2.30 [1.78, 1.82]", True),
+        ("tau = 0.301 [0.272, 0.329]", "tau = 0.3003 [0.2982, 0.3023]", True),
+        ("64 runs, 3 of 20", "65 runs, 3 of 20", False),
+        ("64 runs, 3 of 20", "66 runs, 3 of 20", True),
         ("missing   drive_lag", "missing   turn_lag", True),
         ("runs/8864e66ce2fee5d7/report.html", "runs/0064e66ce2fee5d7/report.html", False),
         ("one line", "one line\nand another", True),

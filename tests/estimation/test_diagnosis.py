@@ -23,11 +23,11 @@ from pipeline.estimation import (
     diagnose_runs,
     load_recording,
 )
-from pipeline.estimation.estimates import expect_another_run, list_values
+from pipeline.estimation.estimates import list_values
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.ladder import judge_whole
 from pipeline.estimation.model_state import Free
-from pipeline.models import find_effect, read_model, write_model
+from pipeline.models import Number, expect_another_run, find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
 from pipeline.results import to_json
@@ -347,12 +347,12 @@ def test_an_interval_holds_its_value_also_beside_the_bounds_of_its_search() -> N
 
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
-    low, high = astuple(expect_another_run(track, 1.8, 1.78, 1.83))
+    low, high = astuple(expect_another_run(track, Number(1.8, 1.78, 1.83)))
     assert low == pytest.approx(1.8 - np.hypot(0.02, NORMAL_95 * 2.0**0.5 * track.spread.size), rel=1e-5)
     assert high == pytest.approx(1.8 + np.hypot(0.03, NORMAL_95 * 2.0**0.5 * track.spread.size), rel=1e-5)
     lag = find_effect("drive_lag")().parameter("tau")
-    assert expect_another_run(lag, 0.1, 0.09, 0.11).low == lag.bounds[0]
-    assert not np.isfinite(astuple(expect_another_run(track, 1.8, math.nan, math.nan))).any()
+    assert expect_another_run(lag, Number(0.1, 0.09, 0.11)).low == lag.bounds[0]
+    assert not np.isfinite(astuple(expect_another_run(track, Number(1.8)))).any()
     for effect, is_known in (
         (find_effect("effective_track")(k=1.8), True),
         (find_effect("terrain_change")(k_v=0.8, k_w=0.7, at_s=60.0), False),

@@ -181,6 +181,39 @@ def test_a_multiplier_is_told_by_speed_where_one_does_not_fit() -> None:
     told = [float(value) for value, _ in pairs]
     assert told == pytest.approx(response.separation.tolist(), abs=1e-3)
     assert [float(speed) for _, speed in pairs] == response.speeds.tolist()
+    # The value of the track alone is another number than those of all effects: it says of what it is.
+    assert f"of all effects together, at a yaw rate of {response.turn:.3g} rad/s" in several
+
+
+def test_an_interval_says_of_which_run_it_is_and_what_another_one_would_show() -> None:
+    ends = {"effective_track.k": (1.79, 1.82)}
+    track = find_effect("effective_track")(k=1.8)
+    (line,) = {
+        line.strip("# ")
+        for line in export_model(make(track, fit=FIT, intervals=ends), "ros2_control").splitlines()
+        if "effective_track.k = " in line
+    }
+    found = re.fullmatch(r".*\(this run, 95 %: 1\.79 to 1\.82; another run: ([\d.]+) to ([\d.]+)\)", line)
+    assert found is not None, line
+    low, high = map(float, found.groups())
+    assert low < ends["effective_track.k"][0] < ends["effective_track.k"][1] < high
+    several = {**FIT, "runs": [*FIT["runs"], *FIT["runs"]]}  # type: ignore[misc]
+    assert "(these runs, 95 %" in export_model(make(track, fit=several, intervals=ends), "ros2_control")
+
+
+def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be() -> None:
+    (run,) = FIT["runs"]  # type: ignore[misc]
+    late = {**FIT, "runs": [{**run, "pose_delay_s": 0.42}]}  # type: ignore[misc]
+    text = export_model(make(find_effect("effective_track")(k=1.8), fit=late), "ros2_control")
+    _, _, rest = text.partition("Not covered by these parameters:")
+    assert "clock_offset.d = 0.42 s: the poses of 'yard/monday' are late" in rest
+
+
+def test_a_parameter_that_no_effect_tells_is_named_as_one_that_is_not_written() -> None:
+    text = export_model(make(find_effect("wheel_servo")(tau=0.3)), "nav2")
+    _, _, unknown = text.partition("Not written, as no effect of the model determines it:")
+    assert "FollowPath.model_delay_wz" in unknown.partition("controller_server:")[0]
+    assert "model_delay_wz" not in unknown.partition("controller_server:")[2]
 
 
 @pytest.mark.parametrize(

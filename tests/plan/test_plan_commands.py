@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -214,6 +215,17 @@ def test_more_time_decides_more_and_stays_inside(plan: Plan) -> None:
     long = _plan(180.0)
     assert long.commands.duration_s <= 180.0
     assert long.area.holds(long.ways)
+
+
+def test_a_short_drive_says_what_more_time_or_room_would_decide(plan: Plan) -> None:
+    short = _plan(20.0)
+    told = re.search(r"--time (\d+)min would decide (\d+) more", short.summarize())
+    assert told is not None
+    assert int(told[2]) == sum(one.longer_s < np.inf for one in short.questions if not one.informs)
+    assert len(_plan(60.0 * float(told[1])).decided) > len(short.decided)
+    more = len(plan.decided) + 1
+    assert f"--area 40x30m would decide {more}" in replace(plan, roomier=(more, 40.0, 30.0)).summarize()
+    assert "--area" not in replace(plan, roomier=None).summarize()
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("60s", 60.0), ("2min", 120.0), ("45", 45.0)])

@@ -66,7 +66,7 @@ DriveOvershoot = declare(
     "tau^2 * d2Omega/dt2 + 2 * damping * tau * dOmega/dt = u - Omega",
     replace(
         TIME_CONSTANT,
-        about="one over the natural frequency",
+        about="inverse natural frequency",
         typical=0.2,
         starts=(),
         search=Search.STARTS,

@@ -58,7 +58,7 @@ class TerrainChange(KinematicEffect):
             "m",
             (-1e6, 1e6),
             NAN,
-            "place of the change along the map's x axis",
+            "place of the change, along the map's x axis",
             0.0,
             instead_of="at_s",
         ),

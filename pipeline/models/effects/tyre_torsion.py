@@ -32,7 +32,7 @@ class TyreTorsion(BodyEffect):
     parameters = (
         replace(
             TIME_CONSTANT,
-            about="one over the natural frequency of the yaw",
+            about="inverse natural frequency, of the yaw",
             typical=0.12,
             starts=(),
             search=Search.STARTS,

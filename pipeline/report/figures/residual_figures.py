@@ -230,7 +230,7 @@ def _draw_signature(signature: Signature, colour: str) -> Drawing:
     return Drawing(
         chart,
         {_name_rows(signature): _tabulate(signature)},
-        f"{format_known_share(signature.explained)} of its effect is a function of the {variable}.",
+        f"{format_known_share(signature.explained)} of its effect follows from the {variable} alone.",
         f"{error} against {variable} [{variable_unit}], in {signature.value.size} bins: root mean square "
         f"{before} without {signature.effect}, {after} with it.",
     )
