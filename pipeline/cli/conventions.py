@@ -374,6 +374,26 @@ def spell_flags(values: Mapping[str, object]) -> str:
     return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in said.items())
 
 
+Force: TypeAlias = Annotated[bool, Parameter(help="replace files that are there", negative=())]
+
+
+def require_new(*paths: Path, force: bool) -> None:
+    """Refuse to write where something is: said before the work, as that would be lost.
+
+    Args:
+        paths: the files to write.
+        force: whether they may be replaced.
+
+    Raises:
+        SlipError: ``file_exists``.
+    """
+    # A link that leads nowhere would be replaced as well.
+    there = next((path for path in paths if path.exists() or path.is_symlink()), None)
+    if there is not None and not force:
+        hint = "Give --force to replace it, or another name"
+        raise SlipError("file_exists", "the file already exists", where=str(there), hint=hint)
+
+
 def open_results(results: Path) -> store.Store:
     """The results in a folder.
 

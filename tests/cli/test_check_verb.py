@@ -75,7 +75,7 @@ def slip_number(name: str) -> object:
 
 def test_limits_gate_a_build_and_the_report_is_a_file(place: Path) -> None:
     (place / "check.toml").write_text('[parameter]\n"drive_lag.tau" = {max = 0.5}\n', encoding="utf-8")
-    options = ("--limits", "check.toml", "--to", "junit", "--file", "check.xml", "--quiet")
+    options = ("--limits", "check.toml", "--to", "junit", "--file", "check.xml", "--force", "--quiet")
 
     check(place, "husky.toml", "logs/b.mcap", *options, code=0)
     kept = (place / "check.xml").read_text(encoding="utf-8")
