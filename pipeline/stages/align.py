@@ -272,7 +272,7 @@ def align_poses(
         at_fault = track.times[mark_spans(track.times, outliers)]
         fit = fit_gyro(track, gyro, np.union1d(excluded, at_fault))
     late, moved = _split_delay(fit, gyro)
-    found = replace(
+    corrected = replace(
         alignment,
         gyro=_put_on_clock(fit, moved),
         heading_delay_s=late,
@@ -280,7 +280,7 @@ def align_poses(
         outlier_s=sum(one.end - one.start for one in outliers),
     )
     outlier = mark_spans(times - own, outliers)
-    return _correct_poses(poses, own + late, outlier), found
+    return _correct_poses(poses, own + late, outlier), corrected
 
 
 def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:

@@ -154,6 +154,6 @@ def pair_poses(track: Track, excluded: Floats, *, early_s: float, longest_s: flo
     first = np.flatnonzero(last < times.size)
     last = last[first]
     begin, end = times[first], times[last]
-    kept = (track.segment[first] == track.segment[last]) & (end - begin < longest_s)
-    kept &= ~has_excluded(excluded, begin, end)
-    return first[kept], last[kept]
+    mask = (track.segment[first] == track.segment[last]) & (end - begin < longest_s)
+    mask &= ~has_excluded(excluded, begin, end)
+    return first[mask], last[mask]
