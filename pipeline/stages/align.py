@@ -4,7 +4,7 @@ They are estimated once, from commands, wheels, poses and gyro as extracted, and
 tables and as numbers, so that every reader of the run gets corrected data.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -251,11 +251,11 @@ def align_poses(
         stamped = read_track(poses, wheels, name=where)
     except MotionError:
         # A log without enough data for a model still has slip.
-        return _correct_poses(poses, own, own > 0.0), alignment
+        return _correct_poses(poses, own, 0.0, outliers), alignment
     if not is_localization:
         # Integrated wheels have no clock of their own.
         fit = fit_gyro(stamped, gyro, excluded)
-        return _correct_poses(poses, own, own > 0.0), replace(alignment, gyro=_put_on_clock(fit))
+        return _correct_poses(poses, own, 0.0, outliers), replace(alignment, gyro=_put_on_clock(fit))
     ages, spread = estimate_latency(stamped, gyro, excluded)
     for segment in np.unique(stamped.segment).tolist():
         rows, known = poses["segment"].to_numpy() == segment, stamped.segment == segment
@@ -272,19 +272,20 @@ def align_poses(
         at_fault = track.times[mark_spans(track.times, outliers)]
         fit = fit_gyro(track, gyro, np.union1d(excluded, at_fault))
     late, moved = _split_delay(fit, gyro)
-    aligned = replace(
+    corrected = replace(
         alignment,
         gyro=_put_on_clock(fit, moved),
         heading_delay_s=late,
         latency_spread_s=spread,
         outlier_s=sum(one.end - one.start for one in outliers),
     )
-    outlier = mark_spans(times - own, outliers)
-    return _correct_poses(poses, own + late, outlier), aligned
+    return _correct_poses(poses, own, late, outliers), corrected
 
 
-def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
-    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
+def _correct_poses(poses: pl.DataFrame, own: Floats, late: float, outliers: Sequence[Span]) -> pl.DataFrame:
+    """Table `poses` with latencies, of each pose its own one besides that of all [s], and outliers."""
+    wrong = mark_spans(poses["t"].to_numpy() - own, outliers)
+    return poses.with_columns(pl.Series("latency", own + late), pl.Series("outlier", wrong))
 
 
 def _split_delay(fit: GyroFit | None, gyro: tuple[Floats, Floats] | None) -> tuple[float, float]:

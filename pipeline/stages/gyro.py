@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from pipeline.core import ROUNDING_S, SILENT_S, Floats, Ints, RobustFit, arrays, fit_robustly, weigh_bounded
+from pipeline.core import (
+    ROUNDING_S,
+    SILENT_S,
+    Floats,
+    Ints,
+    RobustFit,
+    arrays,
+    fit_robustly,
+    robust_spread,
+    weigh_bounded,
+)
 from pipeline.run import SPAN_S, GyroFit, Track, has_excluded, mark_excluded
 
 _EARLY_S, _LONGEST_S = 0.02, 0.8 - ROUNDING_S
@@ -57,7 +67,9 @@ def fit_gyro(  # noqa: PLR0911 - each way out is a reason
 
     def judge(delay: float) -> RobustFit:
         seen = np.interp(end - delay, times, angle) - np.interp(start - delay, times, angle)
-        return fit_robustly(np.column_stack((seen, end - start)), turned, rounds=_REWEIGHTED)
+        return fit_robustly(
+            np.column_stack((seen, end - start)), turned, measure=robust_spread, rounds=_REWEIGHTED
+        )
 
     coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP).tolist()
     best = coarse[int(np.argmin([judge(delay).scale for delay in coarse]))]
@@ -98,7 +110,7 @@ def _refine(
         slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
         design = np.column_stack((turn(delay), end - start, slope))
         rest = turned - design[:, :2] @ np.array([scale, bias])
-        step = fit_robustly(design, rest, weigh=weigh_bounded, rounds=_REWEIGHTED)
+        step = fit_robustly(design, rest, measure=robust_spread, weigh=weigh_bounded, rounds=_REWEIGHTED)
         scale, bias = scale + float(step.gains[0]), bias + float(step.gains[1])
         delay += float(np.clip(step.gains[2], -5 * _DELAY_STEP, 5 * _DELAY_STEP))
         error = float(step.find_errors(design, unit)[2])
@@ -126,7 +138,10 @@ def _fit_scale(
     ends |= np.diff(is_out, prepend=False)
     piece = np.unique(np.cumsum(ends)[mask], return_inverse=True)[1]
     design = np.column_stack((np.interp(at, times, angle), at))[mask]
-    made = fit_robustly(design, track.heading[mask], weigh=weigh_bounded, group=piece, rounds=_REWEIGHTED)
+    heading = track.heading[mask]
+    made = fit_robustly(
+        design, heading, measure=robust_spread, weigh=weigh_bounded, group=piece, rounds=_REWEIGHTED
+    )
     scale, bias = made.gains.tolist()
     return scale, bias
 
@@ -154,6 +169,6 @@ def pair_poses(track: Track, excluded: Floats, *, early_s: float, longest_s: flo
     first = np.flatnonzero(last < times.size)
     last = last[first]
     begin, end = times[first], times[last]
-    kept = (track.segment[first] == track.segment[last]) & (end - begin < longest_s)
-    kept &= ~has_excluded(excluded, begin, end)
-    return first[kept], last[kept]
+    mask = (track.segment[first] == track.segment[last]) & (end - begin < longest_s)
+    mask &= ~has_excluded(excluded, begin, end)
+    return first[mask], last[mask]

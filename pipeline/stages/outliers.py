@@ -10,7 +10,7 @@ by `spans`.
 
 import numpy as np
 
-from pipeline.core import Floats, Ints, arrays, fit_robustly
+from pipeline.core import Floats, Ints, arrays, fit_robustly, robust_spread
 from pipeline.run import DriveSeries, Track, name_inputs
 from pipeline.sources import Vehicle
 from pipeline.stages.gyro import pair_poses
@@ -111,8 +111,11 @@ def _measure_misfit(
         rest += [drive(sideways * turning, 0.1), drive(np.abs(sideways), 0.1)]
         speed = np.hypot(speed, aside[_LAGS_S.index(0.1)])
     columns = np.column_stack((*along, *across, *beside, *rest))
-    parts = (moved.real, moved.imag)
-    size = np.hypot(*(fit_robustly(columns, part, least=_LEAST_NOISE_M, ridge=_RIDGE).rest for part in parts))
+    gap_x, gap_y = (
+        fit_robustly(columns, part, measure=robust_spread, least=_LEAST_NOISE_M, ridge=_RIDGE).rest
+        for part in (moved.real, moved.imag)
+    )
+    size = np.hypot(gap_x, gap_y)
     usual = _spread_by_speed(size, speed / span)
     return size / np.maximum(_FAR * usual, _LEAST_M)
 
