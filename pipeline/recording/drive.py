@@ -589,10 +589,10 @@ def smooth_differences(
     last = np.maximum.accumulate(np.where(changed, times, -np.inf))
     knots = np.flatnonzero(changed | (times - last > _REST_S))
     half = float(np.median(np.diff(times[knots])))
-    ways = (np.append(0.0, np.cumsum(one))[knots] for one in moved)
+    paths = (np.append(0.0, np.cumsum(one))[knots] for one in moved)
     ahead, turning = (
-        (np.interp(times + half, times[knots], way) - np.interp(times - half, times[knots], way))
+        (np.interp(times + half, times[knots], path) - np.interp(times - half, times[knots], path))
         / (2.0 * half)
-        for way in ways
+        for path in paths
     )
     return ahead, turning
