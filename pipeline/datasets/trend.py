@@ -90,8 +90,9 @@ class Trend:
         if not tested:
             need = f"a series takes {FEWEST_OF_TEST} dated runs on terrains that were driven twice or more"
             return f"Nothing can be tested: {need}"
-        steps = format_count(sum(one.is_changed for one in tested), "significant step")
-        return f"{steps} in {len(tested)} of {len(self.series)} series that could be tested"
+        count = sum(one.is_changed for one in tested)
+        steps = format_count(count, "significant step") if count else "No significant step"
+        return f"{steps} in the {len(tested)} of {len(self.series)} series that could be tested"
 
     def to_json(self) -> dict[str, object]:
         """The JSON object of `slip fleet trend`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_count, format_csv
+from pipeline.core import INPUT_WORDS, FigureFormat, Floats, format_count, format_csv
 from pipeline.datasets import (
     ABOUT_UNIT,
     AS_PUBLISHED,
@@ -158,8 +158,10 @@ def _draw_levels(answer: Answer, view: tuple[str, str]) -> Picture | None:
         pl.col("interval").alias("kind"),
     )
     # Intervals are ratios, and those of few runs are wide: on a logarithmic axis all of them are whole.
-    numbers = pl.concat([points["value"], *(spans[name] for name in ("value", "low", "high"))]).drop_nulls()
-    domain = [float(f"{end:.2g}") for end in (0.9 * max(numbers.min(), _LEAST), 1.1 * numbers.max())]
+    ends = [points["value"], *(spans[name] for name in ("value", "low", "high"))]
+    numbers = pl.concat(ends).drop_nulls().to_numpy()
+    least, most = max(float(numbers.min()), _LEAST), max(float(numbers.max()), 2.0 * _LEAST)
+    domain = [0.9 * least, 1.1 * most]
     spans, points = (
         frame.with_columns(pl.col(pl.Float64).clip(lower_bound=domain[0])) for frame in (spans, points)
     )
@@ -338,8 +340,8 @@ def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None =
 
 def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
     """Kinetic energy against terrain complexity, own datasets as large points."""
-    energies = pl.concat([drawn.points["energy"], drawn.own["energy"]])
-    ends = (0.5 * energies.min(), 2.0 * energies.max()) if energies.len() else (1.0, 10.0)
+    energies = pl.concat([drawn.points["energy"], drawn.own["energy"]]).to_numpy()
+    ends = (0.5 * float(energies.min()), 2.0 * float(energies.max())) if energies.size else (1.0, 10.0)
     axes = {
         "x": make_axis(
             "complexity", "terrain complexity (0 flat asphalt, 10 impassable)", _COMPLEXITY, tickCount=10
@@ -411,12 +413,12 @@ def _place_names(drawn: DeploymentMap, ends: tuple[float, float]) -> pl.DataFram
     rows = []
     for name, middle, is_own in marks:
         half = np.array([0.5 * _LETTER[is_own] * len(name), 7.0])
-        free = []
+        free = list[tuple[float, int, Floats]]()
         for step, way in itertools.product((1.0, 2.2), _WAYS):
             place = middle + np.array(way) * (half + step * _RADIUS[is_own] + 2.0)
             inside = bool((place - half >= 0.0).all() and (place + half <= np.array(_MAP)).all())
-            covered = sum(bool((np.abs(place - at) < half + size).all()) for at, size in taken)
-            free.append((covered if inside else math.inf, len(free), place))
+            over = float(sum(bool((np.abs(place - at) < half + size).all()) for at, size in taken))
+            free.append((over if inside else math.inf, len(free), place))
         covered, _, place = min(free, key=lambda one: one[:2])
         if is_own or not covered:
             taken.append((place, half))

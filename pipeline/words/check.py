@@ -34,9 +34,9 @@ _HEAD = (
     Column("before -> after"),
     Column("difference [95 %]"),
     Column("p"),
-    Column("spread"),
+    Column("spread of runs", wide=True),
 )
-_ABOUT = "p: over all numbers of this check; spread: how much runs differ beyond their own errors"
+_ABOUT = "p: over all numbers of this check, against how much runs differ beyond their own errors"
 _ALONE = "intervals: of these recordings alone"
 _SPREAD_UNKNOWN = "how much runs of this robot differ without a change is not known"
 _OTHER_DRIVING = 1.25
@@ -175,7 +175,7 @@ def tabulate_check(check: RunsCheck) -> Table:
         status = Cell(one.status, strong=one.status == "changed")
         rows.append([one.title, status, f"{before} -> {after}", difference, _format_p(one), spread])
     note = _ABOUT if check.is_spread_known else _ALONE
-    return Table("Numbers before and after", _HEAD, rows, note)
+    return Table("Numbers before and after", _HEAD, rows, note).drop_empty()
 
 
 def _explain_unknown(number: CheckedNumber) -> str:

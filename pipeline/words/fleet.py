@@ -108,7 +108,7 @@ def tabulate_trend(trend: Trend, *, everything: bool = True) -> Table:
         if everything or one.step is not None
     ]
     hidden = len(trend.series) - len(rows)
-    note = f"{hidden} more series without a test: --all, or the page" if hidden else ""
+    note = f"{hidden} series cannot be tested: --all, or the page" if hidden else ""
     return Table("All series", (Column("quantity"), Column("of"), Column("course")), rows, note)
 
 

@@ -62,7 +62,7 @@ def test_a_track_that_moved_is_told_with_its_day(tmp_path: Path) -> None:
     # Page, screen and JSON have the same series.
     assert f"{len(content['series'])} series" in page
     assert all(one["step"]["is_significant"] for one in content["series"])
-    assert "3 significant steps in 3 of 3 series that could be tested" in page
+    assert "3 significant steps in the 3 of 3 series that could be tested" in page
 
 
 def test_a_step_is_found_across_grounds_and_another_ground_is_none() -> None:
@@ -95,7 +95,7 @@ def test_few_runs_are_not_tested_and_chance_makes_few_steps() -> None:
     assert trend.summary.startswith("Nothing can be tested: a series takes 6 dated runs")
     screen = format_trend(trend, everything=False)
     assert not any("latest" in line for line in screen)
-    assert "2 more series without a test: --all, or the page" in screen
+    assert "2 series cannot be tested: --all, or the page" in screen
     assert sum("latest" in line for line in format_trend(trend, everything=True)) == len(trend.series)
     rng = np.random.default_rng(9)
     wrong = 0
