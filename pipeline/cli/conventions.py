@@ -140,7 +140,7 @@ def format_counts(counts: Mapping[str, int], width: int = 0) -> list[str]:
 
 
 _USUAL = ("done", "unchanged", "lossy", "failed", "quarantined")
-EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped")
+EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped", "gone")
 """States of logs that need a look, in the order in which they are listed."""
 
 

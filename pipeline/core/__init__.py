@@ -16,7 +16,6 @@ from pipeline.core.compute import (
 from pipeline.core.memory import limit_memory, measure_memory, read_memory
 from pipeline.core.processes import (
     PACKAGE,
-    end_with,
     find_cache_folder,
     keep_current_folder_out,
     name_install,
