@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 
 from pipeline.core import NORMAL_95, fit_robustly, join_parts
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Fit, Motion, Steps, fit
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Motion, MotionFit, Steps, fit
 from pipeline.recording.readings import DELAYS_S, SIDES, UNEXPLAINED, Explained, Reading
 from pipeline.sources import RANGES, find_alike_vehicles
 
@@ -64,7 +64,7 @@ def take_shown(value: float, share: float, made: Explained) -> Length | None:
     return clear or (Length(value, _GUESSED * value) if made.sign("turned") else None)
 
 
-def measure_share_error(one: Fit) -> float:
+def measure_share_error(one: MotionFit) -> float:
     """Relative standard error of a gain."""
     size = abs(float(one.gains[0]))
     spread = one.spread / (NORMAL_95 * size) if size > 0.0 else np.inf

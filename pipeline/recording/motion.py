@@ -88,7 +88,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Fit:
+class MotionFit:
     """Regression under correlated noise with heavy tails.
 
     Attributes:
@@ -116,8 +116,8 @@ def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
     return recur(made, np.where(goes_on[:, 0], theta, 0.0))
 
 
-def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
-    """Fit a channel of the motion by columns.
+def fit(values: Floats, columns: Floats, steps: Steps) -> MotionFit:
+    """MotionFit a channel of the motion by columns.
 
     Args:
         values: increments, shape (n,).
@@ -139,12 +139,12 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     gains, rest = made.gains, made.rest
     blocks: Floats = np.bincount(steps.block, list_likelihoods(rest)).astype(np.float64)
     if not gains.size:
-        return Fit(gains, gains, blocks, blocks)
+        return MotionFit(gains, gains, blocks, blocks)
     error = np.maximum(made.find_errors(design, steps.block), _LEAST_ERROR)
     other = list_likelihoods(rest + 2.0 * gains[0] * design[:, 0])
     turned: Floats = np.bincount(steps.block, other).astype(np.float64)
     spread = measure_spread(values - columns[:, 1:] @ gains[1:], columns[:, 0], float(gains[0]), steps)
-    return Fit(gains, gains / error, blocks, turned, spread)
+    return MotionFit(gains, gains / error, blocks, turned, spread)
 
 
 def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) -> float:
