@@ -140,7 +140,7 @@ def format_counts(counts: Mapping[str, int], width: int = 0) -> list[str]:
 
 
 _USUAL = ("done", "unchanged", "lossy", "failed", "quarantined")
-EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped", "gone")
+EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "left_out", "gone")
 """States of logs that need a look, in the order in which they are listed."""
 
 

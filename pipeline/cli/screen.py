@@ -22,6 +22,7 @@ from pipeline.core import (
     format_recorded,
     format_size,
     mapping_in,
+    name_state,
     number_in,
     objects_in,
 )
@@ -62,7 +63,8 @@ class LineWatch:
         """Say what came of a log and how long the rest may take."""
         self._done += 1
         self._read += size
-        what = f"{line.state}: {line.reason}" if line.reason else line.state
+        state = name_state(line.state)
+        what = f"{state}: {line.reason}" if line.reason else state
         remaining = f", about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
         print_note(
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){remaining}"
@@ -89,7 +91,7 @@ class BarWatch:
         """Move the bar on."""
         del size
         if line.reason:
-            text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
+            text = tidy_line(f"{line.run or line.path} {name_state(line.state)}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
         self._bar.advance(self._task)
 
