@@ -32,6 +32,9 @@ class Watch(Protocol):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Called once: logs to process, logs that are done, size of the former [bytes]."""
 
+    def wait(self, log: str, holder: str) -> None:
+        """Called once for each log that waits for somebody else, with who that is."""
+
     def notify(self, line: Line, size: int) -> None:
         """Called for each finished log, with its size [bytes]."""
 
@@ -54,6 +57,7 @@ class Line:
         refused: whether it has results, but cannot show slip.
         peak_bytes: peak memory of its worker.
         size_bytes: size of the log.
+        waited_for: who was working on it before; empty without anybody.
     """
 
     path: str
@@ -67,6 +71,7 @@ class Line:
     refused: bool = False
     peak_bytes: int = 0
     size_bytes: int = 0
+    waited_for: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +130,17 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     todo = _select(planned, request.shard)
     watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
     lines = [*map(_settle, settled)]
+    waited: dict[str, str] = {}
 
     def note(report: Report) -> None:
-        lines.append(_make_line(report.entry, is_new=report.is_new))
+        path = report.entry.log.path
+        if report.holder:
+            if path not in waited:
+                watch.wait(report.entry.run or path, report.holder)
+            waited[path] = report.holder
+            return
+        line = _make_line(report.entry, is_new=report.is_new)
+        lines.append(replace(line, waited_for=waited.get(path, "")))
         watch.notify(lines[-1], report.entry.log.size)
 
     remaining = _work_through(todo, request, work, note)
@@ -176,7 +189,8 @@ def _work_through(
                     if report.entry.kills == 1:
                         (suspects if executor.spreads_blame else queue).append(task)
                         continue
-                if report.is_busy:
+                if report.holder:
+                    note(report)
                     time.sleep(_BUSY_PAUSE_S)
                     queue.append(task)
                     continue

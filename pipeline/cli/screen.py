@@ -43,8 +43,15 @@ class SilentWatch:
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Ignored."""
 
+    def wait(self, log: str, holder: str) -> None:
+        """Ignored."""
+
     def notify(self, line: Line, size: int) -> None:
         """Ignored."""
+
+
+def _format_wait(log: str, holder: str) -> str:
+    return f"{log} waits: another batch works on it, {holder}"
 
 
 class LineWatch:
@@ -58,6 +65,10 @@ class LineWatch:
         """Say how much there is to do."""
         self._started, self._todo, self._size = time.monotonic(), todo, size
         print_note(f"{format_count(todo, 'log')} to work on ({format_size(size)}), {settled} already done")
+
+    def wait(self, log: str, holder: str) -> None:
+        """Say whom a log waits for."""
+        print_note(_format_wait(log, holder))
 
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
@@ -86,6 +97,10 @@ class BarWatch:
         """Show how much there is to do."""
         del settled, size
         self._bar.update(self._task, total=todo)
+
+    def wait(self, log: str, holder: str) -> None:
+        """Say whom a log waits for."""
+        self._bar.console.print(tidy_line(_format_wait(log, holder)), markup=False, highlight=False)
 
     def notify(self, line: Line, size: int) -> None:
         """Move the bar on."""

@@ -108,7 +108,7 @@ KINDS: dict[str, Kind] = {
     ),
     "a socket": Kind(make_socket, "left_out", "a socket", 3),
     "a pipe that nobody calls a log": Kind(lambda folder, _: os.mkfifo(folder / "pipe")),
-    "a split recording with a pipe in it": Kind(split_with_pipe, "lossy skipped", "a pipe", 3),
+    "a split recording with a pipe in it": Kind(split_with_pipe, "lossy left_out", "a pipe", 3),
     "a folder that may not be read": Kind(
         lambda folder, _: (folder / "forbidden").mkdir(), "left_out", "Permission", 3
     ),
