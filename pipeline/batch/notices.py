@@ -59,7 +59,8 @@ def send(root: Path, command: str, content: Mapping[str, object], news: Mapping[
             check=False,
         )
         last = make_plain(done.stdout.decode("utf-8", "backslashreplace").strip().rpartition("\n")[2])
-        why = f"it ended with exit code {done.returncode}: {shorten(last)}" if done.returncode else ""
+        said = f": {shorten(last)}" if last else ""
+        why = f"it ended with exit code {done.returncode}{said}" if done.returncode else ""
     except subprocess.TimeoutExpired:
         why = f"it took longer than {_NOTIFY_S:g} s"
     if why:
