@@ -49,6 +49,7 @@ HELP = """How far was the motion from the ideal model, and why?
 
 Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
 Write names that begin with a dash after --, behind all options.
+The handbook is the folder docs/pages of the source, which begins with index.md.
 """
 _GROUPS = {
     "Analyze a run": {

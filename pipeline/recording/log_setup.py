@@ -225,10 +225,10 @@ def _describe_stand_in(sources: Sources, index: LogIndex) -> str:
 _WITH_BOTH = "with both, the drive alone could be diagnosed"
 
 
-_RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"
+_RECORD_POSE = "None of its topics holds poses: record a localization's odometry or poses, or the transforms"
 
 
-_RECORD_DRIVE = "None of its topics holds any: record the commands, or the speeds of the wheels"
+_RECORD_DRIVE = "None of its topics holds a drive: record the commands, or the speeds of the wheels"
 
 
 _KNOWN_PACKAGES = (

@@ -27,10 +27,10 @@ LOGS = {
     "field/wied.mcap": r"there is no such file.*Did you mean wide\.mcap",
     "empty.mcap": "is empty",
     "text.mcap": "MCAP",
-    "no_pose.mcap": r"pose.*None of its topics holds any: record.*/cmd_vel",
+    "no_pose.mcap": r"pose.*None of its topics holds poses: record.*/cmd_vel",
     "no_command.mcap": r"command.*\[command\] topic.*/odom",
     "no_vehicle.mcap": r"vehicle.*--vehicle.*husky_a200.*--wheel-radius",
-    "only_images.mcap": r"no topic.*pose.*None of its topics holds any: record.*/camera",
+    "only_images.mcap": r"no topic.*pose.*None of its topics holds poses: record.*/camera",
     "no_messages.mcap": "no message",
 }
 """Logs in which no slip shows, for `slip analyze` and `slip inspect`."""
