@@ -73,7 +73,7 @@ def convert_to(kind: type[Section], tree: Tree) -> Section | Fault:
     else:
         words = ", ".join(str(word) for word in _list_words(kind, steps))
         hint = f"Write one of: {words}." if words else ""
-        wanted, got = found.groups() if (found := _MISMATCH.search(message)) else ("", "")
+        wanted, got = mismatch.groups() if (mismatch := _MISMATCH.search(message)) else ("", "")
         if wanted.startswith("object") and steps:
             hint = f"Write it as a section, [{'.'.join(steps)}], with its keys below."
         elif got == "str" and wanted.startswith(("float", "int")):
@@ -130,14 +130,14 @@ _KINDS = {
 """What a value is, for people."""
 
 
-def _say_kinds(found: re.Match[str]) -> str:
-    wanted = [_KINDS.get(one, one) for one in found[1].split(" | ") if one != "null"]
-    return f"{' or '.join(wanted)} belongs there, not {_KINDS.get(found[2], found[2])},"
+def _describe_kinds(mismatch: re.Match[str]) -> str:
+    wanted = [_KINDS.get(one, one) for one in mismatch[1].split(" | ") if one != "null"]
+    return f"{' or '.join(wanted)} belongs there, not {_KINDS.get(mismatch[2], mismatch[2])},"
 
 
 def _readable(message: str) -> str:
     return (
-        _MISMATCH.sub(_say_kinds, message)
+        _MISMATCH.sub(_describe_kinds, message)
         .replace("Object contains unknown field", "unknown key")
         .replace(" - at `$.", " in `")
         .replace("`$`", "the top level")
