@@ -130,7 +130,7 @@ def run_slip(*arguments: object) -> None:
 def analyze_logs(results: Path, work: Path, logs: Path | None) -> list[Path]:
     """Bring the samples, a run with its wheels in the air, and recordings into results; their reports."""
     lifted = work / f"{LIFTED}.mcap"
-    run_slip("simulate", "--effect", "wheel_radius=0", "--duration", 60, "--file", lifted)
+    run_slip("simulate", "--effect", "wheel_radius=0", "--duration", 60, "--file", lifted, "--force")
     paths = [ROOT / "data_samples" / f"{name}.mcap" for name in (*SAMPLES, "mystery_3")]
     paths += [logs / f"{name}.mcap" for name in RECORDINGS if logs and (logs / f"{name}.mcap").is_file()]
     # Each its own call: of several logs the diagnosis is joint.
@@ -181,8 +181,8 @@ def write_plan(work: Path) -> Screen:
 def write_check(results: Path, work: Path) -> Screen:
     """The page of `slip check`."""
     before, after, page = ROOT / "data_samples" / "husky_tile.mcap", work / "later.mcap", work / "check.html"
-    run_slip("simulate", "husky_tile", "--effect", "drive_lag=0.6", "--seed", 9, "--file", after)
-    run_slip("check", before, after, "--to", "html", "--file", page, "--results", results)
+    run_slip("simulate", "husky_tile", "--effect", "drive_lag=0.6", "--seed", 9, "--file", after, "--force")
+    run_slip("check", before, after, "--to", "html", "--file", page, "--results", results, "--force")
     return Screen("check", page.as_uri())
 
 
@@ -235,7 +235,7 @@ class Studio:
         self._list_reports()
         text, log = self._work / "notes.mcap", self._work / "dropped.mcap"
         text.write_text("no log\n", encoding="utf-8")
-        run_slip("simulate", "husky_tile", "--duration", 60, "--seed", 9, "--file", log)
+        run_slip("simulate", "husky_tile", "--duration", 60, "--seed", 9, "--file", log, "--force")
         empty = self._stack.enter_context(serve_results(self._work / "empty"))
         address = self._stack.enter_context(serve_results(self._results))
         blank = Screen("workbench_empty", empty, "document.querySelector('.sample')")

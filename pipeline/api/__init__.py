@@ -41,6 +41,7 @@ else:
             ),
             "drives": (
                 "check_drive",
+                "list_plan_files",
                 "plan_drive",
             ),
             "fitted_model": (

@@ -86,6 +86,11 @@ class PlannedDrive:
         ]
 
 
+def list_plan_files(folder: Path) -> list[Path]:
+    """The files that a plan may write to a folder."""
+    return [folder / name for name in planning.FILES]
+
+
 def plan_drive(
     names: Sequence[str],
     options: Options,

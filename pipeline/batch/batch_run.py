@@ -12,7 +12,7 @@ from typing import Protocol
 
 from pipeline.batch import Request, Shard
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
-from pipeline.batch.batch_work import STATES, WITH_RESULTS, Entry, Ledger, Report, Task, work_on
+from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
 from pipeline.batch.recordings import find_recordings
 from pipeline.core import SlipError
@@ -32,6 +32,9 @@ class Watch(Protocol):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Called once: logs to process, logs that are done, size of the former [bytes]."""
 
+    def wait(self, log: str, holder: str) -> None:
+        """Called once for each log that waits for somebody else, with who that is."""
+
     def notify(self, line: Line, size: int) -> None:
         """Called for each finished log, with its size [bytes]."""
 
@@ -43,8 +46,9 @@ class Line:
     Attributes:
         path: the recording.
         run: name of its run.
-        state: one of `STATES`, or ``growing``, ``left`` for a log that was not started, ``skipped`` for an
-            unreadable path, for example a folder without permission or a pipe.
+        state: the one of `STATES` under which it is counted and listed: what its results are, new or not. A
+            log without losses is ``unchanged`` where there was nothing to do; ``left_out`` is a path that
+            cannot be read, for example a folder without permission or a pipe.
         code: code of the error.
         reason: why it failed or cannot show slip, or what was lost.
         hint: what to do.
@@ -53,6 +57,7 @@ class Line:
         refused: whether it has results, but cannot show slip.
         peak_bytes: peak memory of its worker.
         size_bytes: size of the log.
+        waited_for: who was working on it before; empty without anybody.
     """
 
     path: str
@@ -66,15 +71,7 @@ class Line:
     refused: bool = False
     peak_bytes: int = 0
     size_bytes: int = 0
-
-    @property
-    def group(self) -> str:
-        """The one of `STATES` under which it is counted and listed: what its results are, new or not."""
-        if self.state != "unchanged":
-            return self.state
-        return (
-            "refused" if self.refused else "lossy" if self.lossy else "copy" if self.reason else "unchanged"
-        )
+    waited_for: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,19 +95,19 @@ class Outcome:
     @property
     def counts(self) -> dict[str, int]:
         """How many logs came out how; each counts once."""
-        groups = [line.group for line in self.lines]
-        return {state: groups.count(state) for state in STATES}
+        states = [line.state for line in self.lines]
+        return {state: states.count(state) for state in STATES}
 
     @property
     def has_failed(self) -> bool:
         """Whether an item that should have results has none."""
-        is_short = any(line.state in {"failed", "quarantined", "left"} for line in self.lines)
+        is_short = any(line.state in {"failed", "quarantined", "not_started"} for line in self.lines)
         return is_short or bool(self.problems)
 
     @property
     def has_losses(self) -> bool:
         """Whether a log with results had losses or cannot show slip, or a path could not be read."""
-        return any(line.lossy or line.refused or line.state == "skipped" for line in self.lines)
+        return any(line.lossy or line.refused or line.state == "left_out" for line in self.lines)
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
@@ -133,20 +130,28 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     todo = _select(planned, request.shard)
     watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
     lines = [*map(_settle, settled)]
+    waited: dict[str, str] = {}
 
     def note(report: Report) -> None:
-        entry = report.entry
-        is_same = entry.state in WITH_RESULTS and not report.is_new
-        lines.append(_make_line(entry, "unchanged" if is_same else entry.state))
-        watch.notify(lines[-1], entry.log.size)
+        path = report.entry.log.path
+        if report.holder:
+            if path not in waited:
+                watch.wait(report.entry.run or path, report.holder)
+            waited[path] = report.holder
+            return
+        line = _make_line(report.entry, is_new=report.is_new)
+        lines.append(replace(line, waited_for=waited.get(path, "")))
+        watch.notify(lines[-1], report.entry.log.size)
 
     remaining = _work_through(todo, request, work, note)
     problems, removed = _tidy_up(store, request)
     not_started = "not started: see the other errors"
-    lines += [Line(path=one.log.path, run=one.run, state="left", reason=not_started) for one in remaining]
+    lines += [
+        Line(path=one.log.path, run=one.run, state="not_started", reason=not_started) for one in remaining
+    ]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
-    lines += [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]
+    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in listed.skipped]
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -184,7 +189,8 @@ def _work_through(
                     if report.entry.kills == 1:
                         (suspects if executor.spreads_blame else queue).append(task)
                         continue
-                if report.is_busy:
+                if report.holder:
+                    note(report)
                     time.sleep(_BUSY_PAUSE_S)
                     queue.append(task)
                     continue
@@ -245,16 +251,15 @@ def _settle(entry: Entry) -> Line:
     """Line of a log that there is nothing to do for."""
     if entry.state == "copy":
         reason = f"the same content as {entry.reason}"
-        return Line(path=entry.log.path, run=entry.reason, state="unchanged", reason=reason)
-    state = entry.state if entry.state in {"quarantined", "ignored"} else "unchanged"
-    return _make_line(replace(entry, seconds=0.0, peak_bytes=0), state)
+        return Line(path=entry.log.path, run=entry.reason, state="copy", reason=reason)
+    return _make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False)
 
 
-def _make_line(entry: Entry, state: str) -> Line:
+def _make_line(entry: Entry, *, is_new: bool) -> Line:
     return Line(
         path=entry.log.path,
         run=entry.run,
-        state=state,
+        state="unchanged" if entry.state == "done" and not is_new else entry.state,
         code=entry.code,
         reason=entry.reason,
         hint=entry.hint,

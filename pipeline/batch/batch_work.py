@@ -21,7 +21,7 @@ from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Sto
 # A ledger entry counts only if the results confirm it: a log is done only while the results contain the
 # generation named in its entry. A lost entry costs one reading of the log.
 
-STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "left", "skipped")
+STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "not_started", "left_out")
 """What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
@@ -135,12 +135,12 @@ class Report:
     Attributes:
         entry: new ledger entry of the log.
         is_new: whether a generation was published; false if nothing had changed.
-        is_busy: whether another batch is working on the same run, so that nothing was done.
+        holder: who is working on the same run, so that nothing was done; empty where nobody is.
     """
 
     entry: Entry
     is_new: bool = False
-    is_busy: bool = False
+    holder: str = ""
 
 
 def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
@@ -168,9 +168,9 @@ def work_on(task: Task) -> Report:
     entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.run)
     is_new = False
     try:
-        with store.claim(entry.run) as is_ours:
-            if not is_ours:
-                return Report(entry=entry, is_busy=True)
+        with store.claim(entry.run) as holder:
+            if holder:
+                return Report(entry=entry, holder=holder)
             entry, is_new = _analyze(task, entry)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""

@@ -12,7 +12,7 @@ from pipeline.store import Store
 
 _NOTIFY_S = 120.0
 """Time that the command of the user may take [s]: mail servers that do not answer give up after a minute."""
-_NEWS = {"lossy", "refused", "failed", "quarantined", "left", "skipped"}
+_NEWS = {"lossy", "refused", "failed", "quarantined", "not_started", "left_out"}
 
 
 def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
@@ -27,7 +27,7 @@ def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
     raised = {
         f"{line.path} {line.code or line.reason}": f"{line.path}: {line.reason}"
         for line in outcome.lines
-        if line.group in _NEWS
+        if line.state in _NEWS
     }
     raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
     notes = Store(root).notes("batch/notified")
@@ -59,7 +59,8 @@ def send(root: Path, command: str, content: Mapping[str, object], news: Mapping[
             check=False,
         )
         last = make_plain(done.stdout.decode("utf-8", "backslashreplace").strip().rpartition("\n")[2])
-        why = f"it ended with exit code {done.returncode}: {shorten(last)}" if done.returncode else ""
+        said = f": {shorten(last)}" if last else ""
+        why = f"it ended with exit code {done.returncode}{said}" if done.returncode else ""
     except subprocess.TimeoutExpired:
         why = f"it took longer than {_NOTIFY_S:g} s"
     if why:

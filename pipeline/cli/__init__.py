@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Literal, get_args, get_origin
 
 from cyclopts import (
@@ -20,6 +21,8 @@ from cyclopts import (
     Group,
     MissingArgumentError,
     Parameter,
+    UnknownCommandError,
+    UnknownOptionError,
     UnusedCliTokensError,
 )
 
@@ -33,12 +36,20 @@ from pipeline.cli.conventions import (
     print_lines,
     summarize_error,
 )
-from pipeline.core import SlipError, keep_current_folder_out, limit_memory, read_version, silence_warnings
+from pipeline.core import (
+    SlipError,
+    guess_names,
+    keep_current_folder_out,
+    limit_memory,
+    read_version,
+    silence_warnings,
+)
 
 HELP = """How far was the motion from the ideal model, and why?
 
 Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
 Write names that begin with a dash after --, behind all options.
+The handbook is the folder docs/pages of the source, which begins with index.md.
 """
 _GROUPS = {
     "Analyze a run": {
@@ -78,7 +89,7 @@ def build_app(verb: str = "") -> App:
         result_action="return_value",
         # `main` handles Ctrl-C, and reports the state of the results.
         suppress_keyboard_interrupt=False,
-        error_formatter=_format_usage,
+        error_formatter=lambda error: CycloptsPanel(_describe_usage(error)),
     )
     known = {name for files in _GROUPS.values() for name in files}
     for index, (title, files) in enumerate(_GROUPS.items()):
@@ -113,21 +124,31 @@ def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | 
     return CLEAN
 
 
-def _format_usage(error: CycloptsError) -> object:
-    """Format the panel of a usage error; for a missing argument it states name and meaning."""
+def _describe_usage(error: CycloptsError) -> str:
+    """What is wrong with the words of a command; for a missing argument its name and meaning."""
     verb = f"slip {' '.join(error.command_chain or ())}".rstrip()
+    rest = " ".join(error.unused_tokens or ())
     if isinstance(error, UnusedCliTokensError):
-        rest = " ".join(error.unused_tokens or ())
-        return CycloptsPanel(f"{verb} takes no further argument: {rest}. See {verb} --help.")
+        return f"{verb} takes no further argument: {rest}. See {verb} --help."
+    if isinstance(error, UnknownCommandError) and rest.split()[:1] in _VERSION_WORDS:
+        return f"slip has no command {rest.split()[0]}. The version is shown by slip --version."
+    if isinstance(error, UnknownOptionError):
+        option = error.token.keyword or error.token.value
+        known = [name.lstrip("-") for one in error.argument_collection for name in one.names]
+        near = guess_names(option.lstrip("-"), dict.fromkeys(known)).replace("mean ", "mean --")
+        return f"{verb} has no option {option}. {near.replace(' or ', ' or --')}See {verb} --help."
     lacking = error.argument
     if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
-        return CycloptsPanel(error)
+        return str(error)
     choices = get_args(lacking.hint) if get_origin(lacking.hint) is Literal else ()
     # The parser reads docstrings for the help alone.
     documented = error.app.assemble_argument_collection(parse_docstring=True) if error.app else ()
     meanings = (one.parameter.help for one in documented if one.name == lacking.name)
     about = " ".join((next(meanings, "") or " or ".join(map(str, choices))).split()).removesuffix(".")
-    return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
+    return f"{verb} needs {lacking.name}{f': {about}' if about else ''}."
+
+
+_VERSION_WORDS = (["version"], ["-v"], ["-V"])
 
 
 def _build_launcher(app: App, words: Sequence[str]) -> App:
@@ -175,12 +196,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         verb = next(iter(words), "")
         if verb == "help":
             words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
+        elif words[1:] == ["help"] and not Path("help").exists():
+            words = [verb, "--help"]
         code = _build_launcher(build_app(verb), words)(
             words, exit_on_error=False, result_action="return_value"
         )
     except CycloptsError as error:
-        chain = " ".join(error.command_chain or ())
-        _refuse_json(words, SlipError("usage", str(error).rstrip("."), hint=f"See slip {chain} --help"))
+        chain = " ".join(("slip", *(error.command_chain or ())))
+        _refuse_json(
+            words, SlipError("usage", _describe_usage(error).rstrip("."), hint=f"See {chain} --help")
+        )
         sys.exit(USAGE)
     except SlipError as error:
         print_error(error)

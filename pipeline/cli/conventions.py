@@ -140,7 +140,7 @@ def format_counts(counts: Mapping[str, int], width: int = 0) -> list[str]:
 
 
 _USUAL = ("done", "unchanged", "lossy", "failed", "quarantined")
-EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped", "gone")
+EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "left_out", "gone")
 """States of logs that need a look, in the order in which they are listed."""
 
 
@@ -319,16 +319,21 @@ class Choices:
 
 
 def _parse_distance(text: str | None) -> float | None:
-    """A distance [m] with or without its unit.
+    """A distance [m] of a text with its unit.
 
     Raises:
         SlipError: ``bad_distance``.
     """
     if text is None:
         return None
-    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(m|cm|mm)?", text.strip())
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(m|cm|mm)", text.strip())
     if match is None or not float(match[1]):
-        raise SlipError("bad_distance", f"{text} is not a length", where="--drove", hint="Give one as 2.00m.")
+        raise SlipError(
+            "bad_distance",
+            f"{text} is not a length with its unit",
+            where="--drove",
+            hint="Give one with its unit, m, cm or mm, as 2.00m.",
+        )
     return float(match[1]) * {"mm": 1e-3, "cm": 1e-2}.get(match[2], 1.0)
 
 

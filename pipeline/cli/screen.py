@@ -22,6 +22,7 @@ from pipeline.core import (
     format_recorded,
     format_size,
     mapping_in,
+    name_state,
     number_in,
     objects_in,
 )
@@ -42,8 +43,15 @@ class SilentWatch:
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Ignored."""
 
+    def wait(self, log: str, holder: str) -> None:
+        """Ignored."""
+
     def notify(self, line: Line, size: int) -> None:
         """Ignored."""
+
+
+def _format_wait(log: str, holder: str) -> str:
+    return f"{log} waits: another batch works on it, {holder}"
 
 
 class LineWatch:
@@ -58,11 +66,16 @@ class LineWatch:
         self._started, self._todo, self._size = time.monotonic(), todo, size
         print_note(f"{format_count(todo, 'log')} to work on ({format_size(size)}), {settled} already done")
 
+    def wait(self, log: str, holder: str) -> None:
+        """Say whom a log waits for."""
+        print_note(_format_wait(log, holder))
+
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
         self._done += 1
         self._read += size
-        what = f"{line.state}: {line.reason}" if line.reason else line.state
+        state = name_state(line.state)
+        what = f"{state}: {line.reason}" if line.reason else state
         remaining = f", about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
         print_note(
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){remaining}"
@@ -85,11 +98,15 @@ class BarWatch:
         del settled, size
         self._bar.update(self._task, total=todo)
 
+    def wait(self, log: str, holder: str) -> None:
+        """Say whom a log waits for."""
+        self._bar.console.print(tidy_line(_format_wait(log, holder)), markup=False, highlight=False)
+
     def notify(self, line: Line, size: int) -> None:
         """Move the bar on."""
         del size
         if line.reason:
-            text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
+            text = tidy_line(f"{line.run or line.path} {name_state(line.state)}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
         self._bar.advance(self._task)
 

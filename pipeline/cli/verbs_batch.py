@@ -121,8 +121,12 @@ def batch(  # noqa: D417 - the shared choices document themselves
     except Exception as error:
         # No logs, a full disk: nobody looks at the screen of a night.
         what = error if isinstance(error, SlipError) else SlipError("unexpected_error", repr(error), hint="")
-        _report(Outcome(lines=(), seconds=0.0, problems=(what,)), choices.results, notify)
-        raise
+        failed = _report(Outcome(lines=(), seconds=0.0, problems=(what,)), choices.results, notify)
+        if not (json and isinstance(error, SlipError)):
+            raise
+        print_error(error)
+        print_json(_as_json(failed))
+        return FAILED
     for problem in outcome.problems:
         print_error(problem)
     outcome = _report(outcome, choices.results, notify)
@@ -167,6 +171,6 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     for state in (*EXPLAINED, "copy"):
-        own = [(line.path, line.reason, line.hint) for line in outcome.lines if line.group == state]
+        own = [(line.path, line.reason, line.hint) for line in outcome.lines if line.state == state]
         lines += explain_logs(name_state(state), own)
     return lines

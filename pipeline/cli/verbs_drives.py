@@ -89,9 +89,7 @@ def plan(  # noqa: D417 - the runs document themselves
         elif not quiet:
             print_lines([*driven.describe(), *([f"next      {following}"] if driven.is_open else [])])
         return LOSSY if driven.lossy else CLEAN
-    from pipeline.plan import FILES  # noqa: PLC0415 - heavy
-
-    require_new(*(folder / name for name in FILES), force=force)
+    require_new(*api.list_plan_files(folder), force=force)
     made = api.plan_drive(
         names,
         options,

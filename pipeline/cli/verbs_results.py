@@ -150,6 +150,8 @@ def status(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Show the state of all logs, or the log, configuration and corrections behind the numbers of one run.
 
+    Exit codes: 0 the results could be read, whatever became of their logs; 1 some of them cannot be read.
+
     Args:
         json: print one JSON object.
     """

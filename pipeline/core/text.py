@@ -144,14 +144,13 @@ _NEARLY_ALL = 0.95
 
 INPUTS = ("command", "measured")
 _STATES = {
-    "lossy": "with losses", "copy": "copies", "growing": "being written", "left": "not started",
-    "skipped": "left out",
+    "lossy": "with losses", "copy": "copies", "growing": "being written",
 }  # fmt: skip
 
 
 def name_state(state: str) -> str:
     """What a log of a batch came out as, in words."""
-    return _STATES.get(state, state)
+    return _STATES.get(state, state.replace("_", " "))
 
 
 INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}

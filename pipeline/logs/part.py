@@ -73,6 +73,11 @@ class FileSource(AbstractContextManager["FileSource"]):
             # Without O_NONBLOCK, opening a pipe would wait for a writer.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError:
+            if path.is_symlink():
+                hint = "Look where it leads: ls -l"
+                raise LogError(
+                    "log_not_found", "it is a link to nothing", where=self.name, hint=hint
+                ) from None
             hint = f"{guess_names(path.name, _list_neighbours(path), end=path.suffix)}Check the path"
             raise LogError("log_not_found", "there is no such file", where=str(path), hint=hint) from None
         except OSError as error:

@@ -16,7 +16,7 @@ from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.findings import Finding, Severity, blame_damage
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.recording.readings import SIDES
-from pipeline.recording.tape import add_lengths, measure_by_tape
+from pipeline.recording.tape import add_lengths, check_lengths, measure_by_tape
 from pipeline.recording.units import JOYSTICK
 from pipeline.run import Alignment
 from pipeline.sources import (
@@ -92,7 +92,7 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
         chosen, configuration = _choose(index, configuration, options)
     except SlipError as error:
         raise add_lengths(error, by_tape) from None
-    chosen = replace(chosen, findings=(*chosen.findings, *by_tape))
+    chosen = replace(chosen, findings=(*chosen.findings, *check_lengths(by_tape, chosen)))
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
     vehicle = chosen.vehicle
@@ -225,10 +225,10 @@ def _describe_stand_in(sources: Sources, index: LogIndex) -> str:
 _WITH_BOTH = "with both, the drive alone could be diagnosed"
 
 
-_RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"
+_RECORD_POSE = "None of its topics holds poses: record a localization's odometry or poses, or the transforms"
 
 
-_RECORD_DRIVE = "None of its topics holds any: record the commands, or the speeds of the wheels"
+_RECORD_DRIVE = "None of its topics holds a drive: record the commands, or the speeds of the wheels"
 
 
 _KNOWN_PACKAGES = (

@@ -10,7 +10,7 @@ from pipeline.logs import LogIndex, read_topics
 from pipeline.recording.case import Case
 from pipeline.recording.extract import Extraction, Given
 from pipeline.recording.findings import Finding
-from pipeline.recording.log_choice import make_stand_in
+from pipeline.recording.log_choice import Choice, make_stand_in
 from pipeline.recording.log_columns import LogColumns
 from pipeline.recording.readings import Held
 from pipeline.recording.topic_values import list_wanted
@@ -18,6 +18,8 @@ from pipeline.sources import Configuration, TruthSection, choose_sources
 
 _TAPE_M, _TAPE = 5e-3, 5e-3
 """Error of a distance by a tape: 5 mm, or half a percent of it if that is more."""
+_FAR = 2.0
+"""Ratio to the vehicle's own length beyond which the tape measured something else: no wheel wears so far."""
 _TURNS = 0.1
 """Error of counted turns: a tenth of one, as a mark on the ground shows."""
 
@@ -70,6 +72,24 @@ def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Findi
     known = {key: one for key, one in values.items() if isinstance(one, list)}
     values["line"] = "; ".join(f"{key} = {one[0]:.4g}" for key, one in known.items() if key.endswith("_m"))
     return [Finding("lengths_by_tape", "warning", "vehicle", values)] if known else []
+
+
+def check_lengths(by_tape: Sequence[Finding], choice: Choice) -> list[Finding]:
+    """What a tape shows; or that it contradicts the vehicle, where the log or the user names one."""
+    if choice.vehicle_source == "fitted" or choice.vehicle.stand_ins:
+        return list(by_tape)
+    checked = []
+    for one in by_tape:
+        values, known = one.values, choice.vehicle.wheel_radius_m
+        taped = values.get("ahead") or values.get("wheel_radius_m")
+        ratio = taped[0] / (known if values["kind"] == "sides" else 1.0) if isinstance(taped, list) else 1.0
+        if not 1.0 / _FAR < ratio < _FAR:
+            said = {"kind": "contradicted", "source": values["source"], "vehicle": choice.vehicle.name}
+            said |= {"value": 1.0 / ratio} | ({"radius_m": known} if values["kind"] == "sides" else {})
+            checked.append(Finding("lengths_by_tape", "warning", "vehicle", said))
+        else:
+            checked.append(one)
+    return checked
 
 
 def add_lengths(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:

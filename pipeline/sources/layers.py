@@ -22,6 +22,7 @@ from pipeline.sources.configuration import (
 
 _PLACE = re.compile(r"at `\$\.?([^`]*)`")
 _UNKNOWN = re.compile(r"unknown field `([^`]*)`")
+_MISMATCH = re.compile(r"Expected `([^`]*)`, got `([^`]*)`")
 _VALUE = re.compile(r"value '([^']*)'")
 _STEP = re.compile(r"[A-Za-z_]\w*|\[")
 
@@ -72,6 +73,11 @@ def convert_to(kind: type[Section], tree: Tree) -> Section | Fault:
     else:
         words = ", ".join(str(word) for word in _list_words(kind, steps))
         hint = f"Write one of: {words}." if words else ""
+        wanted, got = mismatch.groups() if (mismatch := _MISMATCH.search(message)) else ("", "")
+        if wanted.startswith("object") and steps:
+            hint = f"Write it as a section, [{'.'.join(steps)}], with its keys below."
+        elif got == "str" and wanted.startswith(("float", "int")):
+            hint = "Write the number without quotes."
     return Fault(shorten(_readable(message)), hint, [step for step in steps if step != "["], value)
 
 
@@ -117,9 +123,22 @@ def _find(pattern: re.Pattern[str], message: str) -> str:
     return match[1] if match else ""
 
 
+_KINDS = {
+    "object": "a section", "array": "a list", "str": "a text", "float": "a number", "int": "a whole number",
+    "bool": "true or false",
+}  # fmt: skip
+"""What a value is, for people."""
+
+
+def _describe_kinds(mismatch: re.Match[str]) -> str:
+    wanted = [_KINDS.get(one, one) for one in mismatch[1].split(" | ") if one != "null"]
+    return f"{' or '.join(wanted)} belongs there, not {_KINDS.get(mismatch[2], mismatch[2])},"
+
+
 def _readable(message: str) -> str:
     return (
-        message.replace("Object contains unknown field", "unknown key")
+        _MISMATCH.sub(_describe_kinds, message)
+        .replace("Object contains unknown field", "unknown key")
         .replace(" - at `$.", " in `")
         .replace("`$`", "the top level")
     )

@@ -8,6 +8,7 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 
 from pipeline.core import walk_files
@@ -156,20 +157,22 @@ def hold_lock(path: Path, *, patience_s: float) -> Iterator[None]:
         except Timeout as error:
             raise StoreError(
                 "locked",
-                f"{_read_holder(path)} has been writing here for more than {patience_s:g} s",
+                f"{read_holder(path)} has been writing here for more than {patience_s:g} s",
                 where=str(path.parent),
                 hint="Wait until it is done or stop it, then run the same command again",
             ) from error
     try:
         # The note is a courtesy: a full disk must be reported by what needs the space.
         with suppress(OSError):
-            path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
+            since = f"{datetime.now().astimezone():%Y-%m-%d %H:%M}"
+            path.write_text(f"process {os.getpid()} on {platform.node()} (since {since})", encoding="utf-8")
         yield
     finally:
         lock.release()
 
 
-def _read_holder(path: Path) -> str:
+def read_holder(path: Path) -> str:
+    """Who holds a lock, as its file says."""
     with suppress(OSError):
         return path.read_text(encoding="utf-8", errors="replace")[:200] or "another process"
     return "another process"

@@ -18,6 +18,7 @@ from pipeline.store.files import (
     hash_bytes,
     hold_lock,
     make_folder,
+    read_holder,
     remove,
     replace_file,
     temporary_beside,
@@ -346,22 +347,23 @@ class Store:
             probe.unlink()
 
     @contextmanager
-    def claim(self, name: str) -> Iterator[bool]:
+    def claim(self, name: str) -> Iterator[str]:
         """Claim a piece of work for the length of the block, if nobody else has.
 
         Yields:
-            Whether it is ours. Different names may, rarely, stand in each other's way.
+            Empty if it is ours, or who holds it since when. Different names may, rarely, stand in each
+            other's way.
         """
         folder = join_inside(self.root, CLAIMS)
         with name_disk_errors(folder):
             make_folder(folder)
         try:
             with hold_lock(folder / hash_bytes(name.encode())[:3], patience_s=0.0):
-                yield True
+                yield ""
         except StoreError as error:
             if error.code != "locked" or error.where != str(folder):
                 raise
-            yield False
+            yield read_holder(folder / hash_bytes(name.encode())[:3])
 
     def _home_of(self, run: str) -> Path:
         return join_inside(self.root / RUNS, str(encode_run(run)))

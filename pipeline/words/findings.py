@@ -591,8 +591,8 @@ def _wheels_scaled(of: Values) -> str:
     times, radius = of["value"], of["radius_m"]
     return (
         f"in slow driving the wheels turn {times:.2f} times as fast as commanded, and the body moves as "
-        f"commanded: their readings are {times:.2f} times too large (scale = {1.0 / times:.3g} under "
-        f"[wheels] in run.toml), or their radius is {radius / times:.3g} m and not {radius:.3g} m"
+        f"commanded: their readings are {times:.2f} times what they should be (scale = {1.0 / times:.3g} "
+        f"under [wheels] in run.toml), or their radius is {radius / times:.3g} m and not {radius:.3g} m"
     )
 
 
@@ -616,6 +616,13 @@ def _command_scaled(of: Values) -> str:
 
 def _by_tape(of: Values) -> str:
     """Lengths by what was measured by hand, as lines of run.toml, or gains of a body's motion."""
+    if of["kind"] == "contradicted":
+        radius = f" and a wheel radius of {of['radius_m']:.4g} m" if "radius_m" in of else ""
+        return (
+            f"the distance that was measured by hand contradicts the {of['vehicle']}: by {of['source']}"
+            f"{radius} it drove {of['value']:.3g} times as far in this log. No length is taken from it: "
+            "measure all that the log holds, or record the measured drive alone"
+        )
     names = {"ahead": "drives", "turning": "turns"}
     texts = []
     for name in ("wheel_radius_m", "track_width_m", "ahead", "turning"):

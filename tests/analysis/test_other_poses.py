@@ -288,7 +288,7 @@ def test_a_log_without_a_known_pose_names_fields_that_look_like_one(
 def test_commands_and_goals_do_not_look_like_poses(tmp_path: Path) -> None:
     drive = draw_drive()
     goal = record_cdr(drive, "/goal", "lab_msgs/msg/Tracked", flat(drive), FLAT)
-    with pytest.raises(SlipError, match="None of its topics holds any"):
+    with pytest.raises(SlipError, match="None of its topics holds poses"):
         extract_drawn(write_drawn(tmp_path / "run.mcap", record_twist(drive), goal))
 
 

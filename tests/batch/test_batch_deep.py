@@ -32,7 +32,7 @@ def test_a_deep_folder_of_logs_costs_one_line(season: Path, tmp_path: Path, dig:
     dig(season)
     outcome = batch(season, tmp_path / "out")
     assert counts(outcome)["done"] == 4
-    (line,) = [line for line in outcome.lines if line.state == "skipped"]
+    (line,) = [line for line in outcome.lines if line.state == "left_out"]
     assert line.path.startswith(str(season / "d"))
     assert "levels of folders deep" in line.reason
 

@@ -39,6 +39,8 @@ def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
         expected = {"done": 1, "lossy": 1, "failed": 1, "copy": 1, "ignored": 1}
         assert {state: count for state, count in counts.items() if count} == expected
         assert len(told["logs"]) == sum(counts.values())
+        states = [one["state"] for one in told["logs"]]
+        assert {state: told[state] for state in states} == {state: states.count(state) for state in states}
     sent = json.loads((folder / "told.json").read_text())
     assert {state: sent[state] for state in STATES if state != "done"} == {
         state: counts[state] for state in STATES if state != "done"

@@ -1,7 +1,12 @@
 """A season from the outside: what is done, what is left alone, what becomes of whom."""
 
 import hashlib
+import os
+import re
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -125,6 +130,22 @@ def test_a_changed_log_takes_the_place_of_the_old_one(season: Path, tmp_path: Pa
     manifest = Store(out).manifest("season/c")
     assert manifest is not None
     assert len(list_old(manifest)) == 1
+
+
+def test_a_batch_says_once_whom_it_waits_for(season: Path, tmp_path: Path) -> None:
+    watch, request = Watch(), ask(season / "a.mcap", tmp_path / "out")
+    with ExitStack() as claim, ThreadPoolExecutor(1) as pool:
+        assert claim.enter_context(Store(tmp_path / "out").claim("season/a")) == ""
+        outcome = pool.submit(run_batch, request, watch)
+        deadline = time.monotonic() + 20.0
+        while not watch.waits and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.6)
+        claim.close()
+    (line,) = outcome.result().lines
+    ((log, said),) = watch.waits
+    assert (log, line.state, line.waited_for) == ("season/a", "done", said)
+    assert re.fullmatch(rf"process {os.getpid()} on .+ \(since \d{{4}}-\d\d-\d\d \d\d:\d\d\)", said)
 
 
 def test_a_moved_log_is_the_same_run_and_counts_once(season: Path, tmp_path: Path) -> None:

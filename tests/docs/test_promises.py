@@ -97,6 +97,8 @@ def test_a_failure_has_its_keys() -> None:
     (error,) = ask_verb("inspect", "gone.mcap", code=1)["errors"]
     sentence = SECTIONS["JSON"].split("`errors` has")[1].split(" of each")[0]
     assert set(re.findall(r"`(\w+)`", sentence)) <= set(error)
+    (keys,) = re.findall(r"^\| `slip batch` \| \| (.*) \|$", SECTIONS["JSON"], re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", keys)) <= set(ask_verb("batch", "gone", code=1))
 
 
 def test_the_names_of_python_are_there() -> None:

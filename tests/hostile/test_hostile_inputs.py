@@ -27,10 +27,10 @@ LOGS = {
     "field/wied.mcap": r"there is no such file.*Did you mean wide\.mcap",
     "empty.mcap": "is empty",
     "text.mcap": "MCAP",
-    "no_pose.mcap": r"pose.*None of its topics holds any: record.*/cmd_vel",
+    "no_pose.mcap": r"pose.*None of its topics holds poses: record.*/cmd_vel",
     "no_command.mcap": r"command.*\[command\] topic.*/odom",
     "no_vehicle.mcap": r"vehicle.*--vehicle.*husky_a200.*--wheel-radius",
-    "only_images.mcap": r"no topic.*pose.*None of its topics holds any: record.*/camera",
+    "only_images.mcap": r"no topic.*pose.*None of its topics holds poses: record.*/camera",
     "no_messages.mcap": "no message",
 }
 """Logs in which no slip shows, for `slip analyze` and `slip inspect`."""
@@ -42,6 +42,8 @@ WORDS: list[tuple[str, str]] = [
     ("analyze field/wide.mcap --wheel-radius 16 --track-width .5", r"it is in centimetres, write 0\.16\."),
     ("analyze field/wide.mcap --wheel-radius .1 --track-width 555", r"it is in centimetres, write 5\.55\."),
     ("analyze field/wide.mcap --wheel-radius 330 --track-width .5", r"it is in millimetres, write 0\.33\."),
+    ("analyze field/wide.mcap --drove 2", "2 is not a length with its unit"),
+    ("analyze planned/dead.mcap", r"planned/dead\.mcap: it is a link to nothing\. Look where it leads"),
     ("analyze field/wide.mcap --memory much", r"'much' is not a size\. Write for example 500MB or 2GB\."),
     ("analyze field/wide.mcap --model missing.toml", "cannot be read"),
     ("analyze field/wide.mcap --model car.toml", "kind 'ackermann'"),
@@ -166,6 +168,14 @@ USAGE = (
 )  # fmt: skip
 """What is no command: it ends with 2."""
 
+USAGE_WORDS = {
+    "version": r"slip has no command version\. The version is shown by slip --version",
+    "-v": r"shown by slip --version",
+    "analyze log.mcap --rate 3": r"slip analyze has no option --rate\. See slip analyze --help",
+    "analyze log.mcap --vehicel x": r"no option --vehicel\. Did you mean --vehicle\? See",
+}
+"""What is said of some of these."""
+
 HEAD = '[vehicle]\npreset = "husky_a200"\n'
 TRACK = '[[effect]]\nid = "effective_track"\n'
 FORMULA = '[[effect]]\nid = "w"\nv_y = "k * v0"\n'
@@ -222,6 +232,11 @@ CONFIGURATIONS = [
     ("[vehicel]\n", r"line 1: .*unknown key `vehicel`"),
     ("[velocity]\nrate_hz = -1\n", r"velocity\.rate_hz"),
     ('[velocity]\nrate_hz = "fast"\n', r"velocity\.rate_hz"),
+    (
+        '[velocity]\nrate_hz = "20"\n',
+        "line 2: .*a number belongs there, not a text, in `velocity.rate_hz`.*quotes",
+    ),
+    ('vehicle = "husky"\n', r"line 1: .*a section belongs there, not a text, in `vehicle`.*\[vehicle\]"),
     ("[velocity]\nrate_hz = inf\n", r"line 2: .*velocity\.rate_hz = inf is not a finite number"),
     ('[command]\nunit = "mph"\n', r"line 2: .*'mph' in `command\.unit`"),
     ('[pose]\nframes = ["map"]\n', r"pose\.frames"),
@@ -286,6 +301,7 @@ def folder(stored_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("run.mcap", "planned/husky_tile.mcap", "planned/plan.csv", "planned/slip.csv"):
         (folder / name).touch()
     (folder / "dangling.py").symlink_to("nowhere")
+    (folder / "planned" / "dead.mcap").symlink_to("nowhere")
     (folder / "robot.json").write_text('{"format": 1}')
     for name, vehicle in (("jackal", "jackal"), ("car", "ackermann_car")):
         assert run_verb("model", "new", folder / f"{name}.toml", "--vehicle", vehicle).returncode == 0
@@ -401,6 +417,13 @@ def test_usage(folder: Path) -> None:
         done = run_verb(*split(command), "--json", cwd=folder)
         (error,) = json.loads(done.stdout)["errors"]
         assert (done.returncode, error["code"]) == (2, "usage"), command
+
+
+def test_usage_words(folder: Path) -> None:
+    for command, pattern in USAGE_WORDS.items():
+        (error,) = json.loads(run_verb(*split(command), "--json", cwd=folder).stdout)["errors"]
+        assert re.search(pattern, error["message"]), error
+    assert run_verb("analyze", "help", cwd=folder).stdout == run_verb("analyze", "--help", cwd=folder).stdout
 
 
 def test_an_option_that_there_is_not(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -357,3 +358,12 @@ def test_a_tape_and_turns_tell_radius_and_track(
         assert f"{name} = " in format_finding(found)
     with pytest.raises(SlipError, match=r"by hand, \[vehicle\] wheel_radius_m = .*; track_width_m = "):
         set_up_log(log, Options(out=tmp_path))
+
+
+def test_a_tape_that_contradicts_the_vehicle_offers_no_length(samples: Path, tmp_path: Path) -> None:
+    options = Options(out=tmp_path, overrides={"truth": {"distance_m": 0.2, "turns": 3.0}})
+    notes = inspect_log(samples / "husky_tile.mcap", options).notes
+    (found,) = [one for one in notes if one.id == "lengths_by_tape"]
+    assert "wheel_radius_m" not in found.values
+    said = format_finding(found)
+    assert re.search(r"contradicts the .*Husky.* times as far in this log\. No length is taken", said), said
