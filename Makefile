@@ -78,7 +78,7 @@ hidden-effect: $(VENV)/.ready-dev ## draw a log with a hidden effect, diagnose i
 
 samples: $(VENV)/.ready-dev ## make the simulated logs in data_samples again, and the truths of the mysteries
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
-		$(BIN)/slip simulate $$case --file data_samples/$$case.mcap || exit 1; done
+		$(BIN)/slip simulate $$case --file data_samples/$$case.mcap --force || exit 1; done
 	$(BIN)/python benchmarks game/mystery write data_samples
 
 release: $(VENV)/.ready-dev ## the version of pyproject.toml: checks, tests, wheel, notes and tag, nothing is sent

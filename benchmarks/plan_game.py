@@ -18,7 +18,7 @@ from measuring import add_row, read_rows
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.plan import (
     check_plan,
@@ -123,7 +123,7 @@ def play(seed: int, folder: Path) -> Score:
     return score
 
 
-def record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
+def record(scenario: Scenario, path: Path) -> tuple[Vehicle, DiagnosisInput]:
     """Simulate a run, analyze it, and give it as it is diagnosed."""
     write_log(simulate_run(scenario), path)
     options = Options(out=path.parent / "results", report=False, diagnosis=False)

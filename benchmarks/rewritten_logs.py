@@ -174,6 +174,10 @@ def list_changes() -> list[Change]:
         Change("left encoder dies", _die("left", 0.0), "left wheels' encoder reads (nothing|the same)"),
         Change("right encoder holds", _die("right", None), "right wheels' encoder reads (nothing|the same)"),
         Change("left encoder counts double", _on_wheels(2.0, 1.0), "counts? 2 times|low against the other"),
+        Change("positions of the wheels in turns", _on_joints(_turn, "position"), "position"),
+        Change("a counter of the wheels jumps", _on_joints(_jump, "position"), "jump"),
+        Change("wheels stamped in whole seconds", _stamp_coarsely, "whole seconds|share their|log times"),
+        Change("in a namespace, beside another robot", _name_robots, "robots?"),
         Change("wheels in rpm", _on_wheels(30.0 / math.pi, 30.0 / math.pi), "rpm"),
         Change("wheels x 3", _on_wheels(3.0, 3.0), "radius|unit"),
         Change("command reversed", _on_command(-1.0, 1.0), "linear.x|sign"),
@@ -261,6 +265,82 @@ def _on_wheels(left: float, right: float) -> Callable[[Log, Roles], Log | None]:
 
 def _on_command(ahead: float, turn: float) -> Callable[[Log, Roles], Log | None]:
     return lambda log, roles: _scale_command(log, roles, ahead, turn)
+
+
+def _on_joints(make: Callable[[float, float], float], field: str) -> Callable[[Log, Roles], Log | None]:
+    """One number of all joints that do not steer, by its value and the part of the log that is past."""
+
+    def change_all(log: Log, roles: Roles) -> Log | None:
+        joints, (first, last) = _joints(log, roles), log.length
+
+        def change(one: Message) -> Message:
+            if one.topic != joints:
+                return one
+            content, past = _copy(one.content), (one.log_time - first) / max(last - first, 1)
+            values = zip(content["name"], content[field], strict=False)
+            content[field] = [value if "steer" in name else make(value, past) for name, value in values]
+            return replace(one, content=content)
+
+        known = [one.content for one in log.messages if one.topic == joints]
+        moves = any(any(getattr(one, field)) for one in known) and any(any(one.velocity) for one in known)
+        return _each(log, change) if moves else None
+
+    return change_all
+
+
+def _turn(value: float, _: float) -> float:
+    return value / (2.0 * math.pi)
+
+
+def _jump(value: float, past: float) -> float:
+    return value + 2.0 * math.pi * 65536.0 / 2048.0 * (past > _HALF)
+
+
+_HALF = 0.5
+"""Part of a log after which a counter has jumped."""
+
+
+def _stamp_coarsely(log: Log, roles: Roles) -> Log | None:
+    """Wheels stamped by a clock that counts seconds."""
+
+    def change(one: Message) -> Message:
+        if one.topic not in roles.wheels:
+            return one
+        content = _copy(one.content)
+        content["header"]["stamp"]["nanosec"] = 0
+        return replace(one, content=content)
+
+    return _each(log, change) if _joints(log, roles) else None
+
+
+def _name_robots(log: Log, roles: Roles) -> Log | None:
+    """All topics and frames in a namespace; in another one a robot stands, with the same frames."""
+    framed = ("Odometry", "TFMessage", "PoseStamped", "PoseWithCovarianceStamped")
+    transforms = [one for one in log.messages if one.kind.endswith("TFMessage")]
+    if roles.pose not in {one.topic for one in transforms}:
+        return None
+
+    def prefix(content: Content, space: str) -> Content:
+        if isinstance(content, dict):
+            return {
+                name: f"{space}/{value}" if name.endswith("frame_id") else prefix(value, space)
+                for name, value in content.items()
+            }
+        return [prefix(one, space) for one in content] if isinstance(content, list) else content
+
+    made: list[Message] = []
+    standing = {one.topic: _copy(one.content) for one in reversed(transforms)}
+    for one in log.messages:
+        content = prefix(_copy(one.content), "robot_b") if one.kind.endswith(framed) else one.content
+        topic = one.topic if one.topic in standing else f"/robot_b{one.topic}"
+        made.append(replace(one, topic=topic, content=content))
+        if one.topic in standing:
+            stamps = [part["header"]["stamp"] for part in _copy(one.content)["transforms"]]
+            still = prefix(standing[one.topic], "robot_a")
+            for part in still["transforms"]:
+                part["header"] = part["header"] | {"stamp": stamps[0]}
+            made.append(replace(one, content=still))
+    return replace(log, messages=made)
 
 
 def _exchange(log: Log, roles: Roles) -> Log | None:

@@ -37,7 +37,7 @@ from game.true_model import Checked, check_models
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.sources import Vehicle
 from pipeline.words.objects import diagnosis_as_json
@@ -198,7 +198,7 @@ def _play(job: Job, riddle: Riddle, log: Path) -> Record:
     )
 
 
-def _ask(logs: Sequence[Path], watch: Watch) -> tuple[Vehicle, Recording, Sequence[Json]]:
+def _ask(logs: Sequence[Path], watch: Watch) -> tuple[Vehicle, DiagnosisInput, Sequence[Json]]:
     """What `slip diagnose LOG... --json` does, in this process."""
     with watch.measure("stages"):
         loaded = [_load(log) for log in logs]
@@ -209,7 +209,7 @@ def _ask(logs: Sequence[Path], watch: Watch) -> tuple[Vehicle, Recording, Sequen
     return vehicle, recording, told
 
 
-def _ask_program(logs: Sequence[Path]) -> tuple[Vehicle, Recording, Sequence[Json]]:
+def _ask_program(logs: Sequence[Path]) -> tuple[Vehicle, DiagnosisInput, Sequence[Json]]:
     """The program itself."""
     out = str(logs[0].parent / "out")
     command = [sys.executable, "-m", "pipeline", "diagnose", *map(str, logs), "--json", "--results", out]
@@ -219,7 +219,7 @@ def _ask_program(logs: Sequence[Path]) -> tuple[Vehicle, Recording, Sequence[Jso
     return *_load(logs[0]), json.loads(done.stdout)["runs"]
 
 
-def _load(log: Path) -> tuple[Vehicle, Recording]:
+def _load(log: Path) -> tuple[Vehicle, DiagnosisInput]:
     """The log taken through the stages, or what is stored of it."""
     return read_recording(analyze_log(log, Options(out=log.parent / "out", report=False)).manifest)
 

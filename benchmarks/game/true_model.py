@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from game.draw import Answer
-from pipeline.estimation import EstimationData, Input, Recording, fit_model, hold_out, load_recording
+from pipeline.estimation import DiagnosisInput, EstimationData, Input, fit_model, hold_out, load_recording
 from pipeline.estimation.errors import measure_errors
 from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
 from pipeline.models.effect import Late, find_late
@@ -71,7 +71,7 @@ class Checked:
         return self.true is not None and beside is not None and not self.true.falls_below(beside)
 
 
-def check_models(vehicle: Vehicle, recording: Recording, told: Json, answer: Answer) -> Checked:
+def check_models(vehicle: Vehicle, recording: DiagnosisInput, told: Json, answer: Answer) -> Checked:
     """Fit and judge the true model and the named one on a diagnosed log.
 
     Args:

@@ -13,7 +13,7 @@ from pipeline import plan as planning
 from pipeline.analysis import Options
 from pipeline.api.opening import Opener, Progress, open_quietly, show_nothing
 from pipeline.core import SlipError, format_count, format_duration
-from pipeline.estimation import Recording, diagnose_runs, load_recording
+from pipeline.estimation import DiagnosisInput, diagnose_runs, load_recording
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.plan import SAFETY, CheckedPlan, Plan
 from pipeline.report.drive_pages import leave_plan, write_drive
@@ -230,7 +230,7 @@ class _Gathered(NamedTuple):
     """Runs of one vehicle, and whether one had losses."""
 
     vehicle: Vehicle
-    recordings: list[Recording]
+    recordings: list[DiagnosisInput]
     manifests: list[Manifest]
     lossy: bool
 

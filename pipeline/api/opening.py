@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import OpenedRun, open_run
-from pipeline.estimation import Recording
+from pipeline.estimation import DiagnosisInput
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
@@ -42,7 +42,7 @@ class ReadRun:
 
     manifest: Manifest
     vehicle: Vehicle
-    recording: Recording
+    recording: DiagnosisInput
 
 
 def read_run(manifest: Manifest) -> ReadRun:

@@ -1,7 +1,7 @@
 """Status of a batch (done, failed, quarantined), and verification and repair of results."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 from pipeline.batch.batch_plan import forget_pools, measure_results
@@ -247,7 +247,11 @@ def read_status(store: Store) -> Status:
     """Read the status from the results and the ledger."""
     survey = store.survey()
     known = Ledger(store).read_all()
-    entries = tuple(known[note["path"]] for note in list_noted(store) if note["path"] in known)
+    noted = [note for note in list_noted(store) if note["path"] in known]
+    entries = tuple(
+        replace(known[note["path"]], state=note["state"], reason=note["reason"], hint=note["hint"])
+        for note in noted
+    )
     size, unread = measure_results(store)
     return Status(
         runs=len(survey.manifests),

@@ -168,9 +168,13 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[li
     paths = [path for path in paths if path not in ignored]
     hasher = Fingerprinter(request.options)
     tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
-    settled += [task.before for task in tasks if task.before and _is_settled(task, manifests, request)]
+    owners = _find_owners(tasks, manifests)
+    settled += [
+        task.before for task in tasks if task.before and _is_settled(task, manifests, owners, request)
+    ]
     done = {entry.log.path for entry in settled}
-    runs, copies = _name_tasks([task for task in tasks if task.log.path not in done], tasks, manifests, store)
+    fresh = [task for task in tasks if task.log.path not in done]
+    runs, copies = _name_tasks(fresh, tasks, manifests, owners, store)
     todo: list[Task] = []
     for task in tasks:
         if task.path in copies:
@@ -203,7 +207,19 @@ def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], opt
     return Task(path=path, log=log, fingerprint=fingerprint, options=options, before=before)
 
 
-def _is_settled(task: Task, manifests: Mapping[str, Manifest], request: Request) -> bool:
+def _find_owners(tasks: Sequence[Task], manifests: Mapping[str, Manifest]) -> dict[str, str]:
+    """Path of the log of each run: the first of those that are there and had its results."""
+    owners: dict[str, str] = {}
+    for task in sorted(tasks, key=lambda task: task.log.path):
+        entry = task.before
+        if entry is not None and entry.state in WITH_RESULTS and entry.run in manifests:
+            owners.setdefault(entry.run, task.log.path)
+    return owners
+
+
+def _is_settled(
+    task: Task, manifests: Mapping[str, Manifest], owners: Mapping[str, str], request: Request
+) -> bool:
     """Whether there is nothing to do for a log that a batch has seen before."""
     entry = task.before
     if entry is None or not entry.fits(task.log, task.fingerprint) or request.options.force:
@@ -214,22 +230,30 @@ def _is_settled(task: Task, manifests: Mapping[str, Manifest], request: Request)
     if entry.state == "quarantined":
         return not request.retries_quarantined
     if entry.state == "copy":
-        return entry.reason in manifests
-    if entry.state not in WITH_RESULTS or manifest is None:
+        original = manifests.get(entry.reason)
+        path = "" if original is None else str(original.part("log").get("path"))
+        return bool(path) and (entry.reason in owners or "://" in path or Path(path).exists())
+    if entry.state not in WITH_RESULTS or manifest is None or owners.get(entry.run) != task.log.path:
         return False
     return manifest.key == entry.key and (entry.has_report or not request.options.report)
 
 
 def _name_tasks(
-    todo: Sequence[Task], tasks: Sequence[Task], manifests: Mapping[str, Manifest], store: Store
+    todo: Sequence[Task],
+    tasks: Sequence[Task],
+    manifests: Mapping[str, Manifest],
+    owners: Mapping[str, str],
+    store: Store,
 ) -> tuple[dict[Path, str], dict[Path, str]]:
     """Runs of the logs to work on, and of those that are copies the run of the same content."""
     identities = LogIdentities(store)
     logs = {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
-    paths = {run: str(to_location(str(log.get("path")))) for run, log in logs.items()}
+    paths = {run: str(to_location(str(log.get("path")))) for run, log in logs.items()} | dict(owners)
     known_runs = {path: run for run, path in paths.items()}
     known_runs |= {
-        task.log.path: task.before.run for task in tasks if task.before and task.before.run in manifests
+        task.log.path: task.before.run
+        for task in tasks
+        if task.before and task.before.run in manifests and task.before.run not in owners
     }
     new = {task.path: task.log.size for task in todo if task.log.path not in known_runs}
     locations = {task.log.path: task.path for task in tasks}

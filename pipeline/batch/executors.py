@@ -18,13 +18,14 @@ from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import forkserver
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 from pebble import ProcessExpired, concurrent
 
 from pipeline.batch import BatchError
 from pipeline.batch.batch_work import Report, Task, work_safely
-from pipeline.core import end_with, limit_memory, prepare_workers, require_package, silence_warnings
+from pipeline.core import limit_memory, prepare_workers, require_package, silence_warnings
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ _LIBRARIES = ["pipeline.analysis.analyze", "pipeline.store.parquet_tables", "num
 """What every log needs; they are loaded once, and not in every process."""
 _GRACE_S = 2.0
 """Time after which a process that did not end itself is killed [s]: a library may hold the interpreter."""
+_ORPHAN_PERIOD_S = 0.5
+"""Period of checking for the server [s]: a check takes microseconds."""
 _DEATHS = "batch/deaths"
 SCHEMES = ("tcp://", "tls://", "ucx://")
 _CONNECT_S = 20
@@ -104,14 +107,25 @@ def _start_processes(work: Callable[[Task], Report], limits: Limits, jobs: int) 
     # The argument has either name: that of the signature, and that which is read.
     contexts: Any = {"context": server, "mp_context": server}
     start = concurrent.process(timeout=limits.timeout_s + _GRACE_S, **contexts)(_run_alone)
-    return Executor(lambda task: start(work, task, limits), depth=jobs)
+    # Nobody writes to it: it closes with this process, however that ends.
+    line, end = server.Pipe(duplex=False)
+    return Executor(lambda task: start(work, task, limits, line), end.close, depth=jobs)
 
 
-def _run_alone(work: Callable[[Task], Report], task: Task, limits: Limits) -> Report:
+def _run_alone(
+    work: Callable[[Task], Report], task: Task, limits: Limits, line: Connection[None, None]
+) -> Report:
     silence_warnings()
-    # The server ends with the batch, and this process with the server.
-    end_with(os.getppid())
+    # Not with the server alone: that lives as long as a process of it does.
+    threading.Thread(target=_end_with, args=(line, os.getppid()), name="parent", daemon=True).start()
     return run_guarded(work, task, limits)
+
+
+def _end_with(line: Connection[None, None], server: int) -> None:
+    """End this process, and free what it claims, when the batch or the server of its processes has ended."""
+    while os.getppid() == server and not line.poll(_ORPHAN_PERIOD_S):
+        pass
+    os._exit(1)
 
 
 def run_guarded(work: Callable[[Task], Report], task: Task, limits: Limits) -> Report:

@@ -423,4 +423,4 @@ def _measure(path: Path) -> int:
 
 
 def _list_files(path: Path) -> list[Path]:
-    return [file for file in list_files(path) if file.is_file()] if path.is_dir() else [path]
+    return list_files(path) if path.is_dir() else [path]

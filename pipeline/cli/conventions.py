@@ -140,7 +140,7 @@ def format_counts(counts: Mapping[str, int], width: int = 0) -> list[str]:
 
 
 _USUAL = ("done", "unchanged", "lossy", "failed", "quarantined")
-EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped")
+EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", "skipped", "gone")
 """States of logs that need a look, in the order in which they are listed."""
 
 
@@ -372,6 +372,26 @@ def spell_flags(values: Mapping[str, object]) -> str:
     """Flags with their values, a space before each; what is None is left out."""
     said = {name: value for name, value in values.items() if value is not None}
     return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in said.items())
+
+
+Force: TypeAlias = Annotated[bool, Parameter(help="replace files that are there", negative=())]
+
+
+def require_new(*paths: Path, force: bool) -> None:
+    """Refuse to write where something is: said before the work, as that would be lost.
+
+    Args:
+        paths: the files to write.
+        force: whether they may be replaced.
+
+    Raises:
+        SlipError: ``file_exists``.
+    """
+    # A link that leads nowhere would be replaced as well.
+    there = next((path for path in paths if path.exists() or path.is_symlink()), None)
+    if there is not None and not force:
+        hint = "Give --force to replace it, or another name"
+        raise SlipError("file_exists", "the file already exists", where=str(there), hint=hint)
 
 
 def open_results(results: Path) -> store.Store:

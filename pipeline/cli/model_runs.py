@@ -17,12 +17,14 @@ from pipeline import api, models, sources, store, words
 from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
+    Force,
     OwnEffects,
     Results,
     open_shown,
     print_lines,
     print_note,
     print_result,
+    require_new,
 )
 from pipeline.core import INPUT_WORDS, SlipError, format_count
 
@@ -37,20 +39,19 @@ def open_model(path: Path, effects: Sequence[Path] | None) -> models.ModelFile:
     return models.read_model(path)
 
 
-def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> int:
+def new_effect(  # noqa: D417 - the shared option documents itself
+    file: Path, /, *, force: Force = False, quiet: bool = False
+) -> int:
     """Write a template of an effect of your own.
 
     The template runs unchanged.
 
     Args:
         file: the Python file to write; the effect has the name of the file, wind for wind.py.
-        force: replace a file that is there.
         quiet: print nothing.
     """
     text = models.draft_effect(file)
-    if file.exists() and not force:
-        what, hint = "the file already exists", "Give --force to replace it."
-        raise SlipError("effect_exists", what, where=str(file), hint=hint)
+    require_new(file, force=force)
     models.write_text(file, text, code="effect_unwritable")
     if not quiet:
         own, model = shlex.quote(str(file)), shlex.quote(str(file.with_name("robot.toml")))

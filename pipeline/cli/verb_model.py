@@ -13,10 +13,12 @@ from cyclopts import App, Parameter
 from pipeline import api, models, sources, words
 from pipeline.cli.conventions import (
     CLEAN,
+    Force,
     OwnEffects,
     Results,
     print_lines,
     print_note,
+    require_new,
 )
 from pipeline.cli.model_runs import (
     Against,
@@ -48,7 +50,7 @@ def new(  # noqa: D417 - the shared option documents itself
     vehicle: str,
     template: Annotated[str | None, Parameter(name="--from")] = None,
     effects: OwnEffects = None,
-    force: bool = False,
+    force: Force = False,
     quiet: bool = False,
 ) -> int:
     """Make a model file for a vehicle.
@@ -58,12 +60,9 @@ def new(  # noqa: D417 - the shared option documents itself
         ids: ids of effects to begin with, at neutral values, as `slip effects` lists them.
         vehicle: vehicle preset, for example husky_a200.
         template: a model of the literature to begin with, as `slip model literature` lists them.
-        force: replace a file that is there.
         quiet: print nothing.
     """
-    if model.exists() and not force:
-        what, hint = "the file already exists", "Give --force to replace it."
-        raise SlipError("model_exists", what, where=str(model), hint=hint)
+    require_new(model, force=force)
     section = sources.VehicleSection(preset=vehicle)
     chosen = sources.resolve_vehicle(section, recorded=None, where=str(model))
     made = models.find_model(template or "ideal").make(chosen)
@@ -250,6 +249,7 @@ def export(  # noqa: D417 - the options document themselves
     ] = None,
     results: Results = Path("results"),
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    force: Force = False,
     effects: OwnEffects = None,
 ) -> int:
     """Export a model to what people run.
@@ -260,6 +260,8 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
+    if file is not None:
+        require_new(file, force=force)
     opened = open_model(model, effects)
     if on:
         api.require_errors(to)

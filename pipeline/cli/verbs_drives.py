@@ -15,6 +15,7 @@ from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
     Choices,
+    Force,
     Results,
     build_options,
     open_shown,
@@ -22,8 +23,10 @@ from pipeline.cli.conventions import (
     print_lines,
     print_note,
     print_result,
+    require_new,
     show_progress,
     spell_choices,
+    spell_flags,
 )
 from pipeline.core import SlipError, align_rows
 
@@ -48,6 +51,7 @@ def plan(  # noqa: D417 - the runs document themselves
     config: Path | None = None,
     results: Results = Path("results"),
     folder: Path = Path("plan"),
+    force: Force = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -76,6 +80,8 @@ def plan(  # noqa: D417 - the runs document themselves
     opened, progress = partial(open_shown, quiet=silent), partial(show_progress, quiet=silent)
     if check is not None:
         driven = api.check_drive(check, names, options, opened=opened, progress=progress)
+        home = (check if check.is_dir() else check.parent).resolve()
+        said += spell_flags({"folder": f"{home.name}_next"})
         following = f"slip plan {shlex.join(dict.fromkeys([*driven.earlier, *names]))}{said}"
         if json:
             checked, following_up = driven.checked, following if driven.is_open else None
@@ -83,6 +89,9 @@ def plan(  # noqa: D417 - the runs document themselves
         elif not quiet:
             print_lines([*driven.describe(), *([f"next      {following}"] if driven.is_open else [])])
         return LOSSY if driven.lossy else CLEAN
+    from pipeline.plan import FILES  # noqa: PLC0415 - heavy
+
+    require_new(*(folder / name for name in FILES), force=force)
     made = api.plan_drive(
         names,
         options,
@@ -118,7 +127,8 @@ def simulate(  # noqa: D417 - arguments document themselves
         list[str] | None,
         Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated"),
     ] = None,
-    file: Path | None = None,
+    file: Path = Path("run.mcap"),
+    force: Force = False,
     seed: int | None = None,
     duration: PositiveFloat | None = None,
     vehicle: str | None = None,
@@ -134,7 +144,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     The log does not contain the true values.
 
     Args:
-        file: the log to write (run.mcap).
+        file: the log to write, or a folder to write it to, named after the case.
         seed: seed of driving and noise.
         duration: length of the run [s].
         vehicle: simulated vehicle.
@@ -162,10 +172,12 @@ def simulate(  # noqa: D417 - arguments document themselves
     if len(effects) < len(effect or []):
         hint = "Give all its numbers at once: --effect ID=NAME:VALUE,NAME:VALUE."
         raise SlipError("effect_twice", "an effect is given twice", where=" ".join(effect or []), hint=hint)
-    path = simulate_case(
+    path = file / f"{case or 'simulated'}.mcap" if file.is_dir() else file
+    require_new(path, force=force)
+    simulate_case(
         case,
         effects,
-        out=file or Path("run.mcap"),
+        out=path,
         seed=seed,
         duration_s=duration,
         vehicle=vehicle,

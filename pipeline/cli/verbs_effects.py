@@ -14,6 +14,7 @@ from pipeline.cli.conventions import (
     All,
     Asked,
     Choices,
+    Force,
     OwnEffects,
     Results,
     build_options,
@@ -23,6 +24,7 @@ from pipeline.cli.conventions import (
     print_lines,
     print_note,
     print_result,
+    require_new,
     show_progress,
     spell_choices,
     spell_flags,
@@ -44,6 +46,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         Parameter(help="geometry to use where the run is of another vehicle than --model"),
     ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
+    force: Force = False,
     asked: Asked,
     budget: str | None = None,
     everything: All = False,
@@ -63,6 +66,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """
     if apply is not None:
         models.check_target(apply)
+        require_new(apply, force=force)
     models.load_effects(effects or ())
     known = None if model is None else models.read_model(model)
     budget_s = None if budget is None else api.parse_budget(budget)
@@ -207,6 +211,7 @@ def export(  # noqa: D417 - the results folder documents itself
     file: Path | None = None,
     model: Path | None = None,
     frame: str = "map",
+    force: Force = False,
     effects: OwnEffects = None,
     results: Results = Path("results"),
     json: bool = False,
@@ -232,9 +237,13 @@ def export(  # noqa: D417 - the results folder documents itself
     )
 
     manifest = store.find_run(run, store.Store(results))
+    path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
+    is_folder = to in {"csv", "parquet"} and path.is_dir()
+    require_new(
+        *([path / f"{table}.{to}" for table in manifest.tables] if is_folder else [path]), force=force
+    )
     models.load_effects(effects or ())
     known = None if model is None else models.read_model(model)
-    path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
     if to in {"csv", "parquet"}:
         written = write_tables(manifest, to, path)
     elif to == "mcap":

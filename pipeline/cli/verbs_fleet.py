@@ -12,12 +12,14 @@ from cyclopts import App, Parameter
 from pipeline import api, models, words
 from pipeline.cli.conventions import (
     All,
+    Force,
     OwnEffects,
     Results,
     open_shown,
     print_json,
     print_lines,
     print_result,
+    require_new,
 )
 from pipeline.core import SlipError
 
@@ -35,6 +37,7 @@ def check(  # noqa: D417 - the arguments document themselves
     ] = None,
     to: Annotated[Literal["markdown", "junit", "html"] | None, Parameter(help="format of --file")] = None,
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    force: Force = False,
     effects: OwnEffects = None,
     results: Results = Path("results"),
     json: bool = False,
@@ -58,6 +61,8 @@ def check(  # noqa: D417 - the arguments document themselves
     if to is not None and file is None and json:
         what, hint = f"--json and --to {to} would both be printed", "Add --file FILE, or leave one out."
         raise SlipError("wrong_options", what, hint=hint)
+    if file is not None:
+        require_new(file, force=force)
     if Path(after).suffix == ".toml":
         what = "AFTER is a model file, and not what was driven"
         hint = f"Give it first and the log, folder or run second: slip check {after} LOG."

@@ -60,7 +60,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         diagnosis: diagnose logs that are dropped on the page.
         timeout: longest time for an analysis or a diagnosis [s].
         open_browser: open the page in the browser.
-        json: print address and token as one JSON object.
+        json: print address, token and the page with both as one JSON object.
         quiet: print nothing.
     """
     for package in ("uvicorn", "starlette", "numba", "vl_convert"):
@@ -73,7 +73,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     def notify(address: str, token: str) -> None:
         whole = f"{address}?token={token}{opened}"
         if json:
-            print_json({"address": address, "token": token})
+            print_json({"address": address, "token": token, "page": whole})
         elif not quiet:
             print(f"workbench  {whole}    (Ctrl-C ends it)")
         sys.stdout.flush()

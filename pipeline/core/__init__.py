@@ -16,7 +16,6 @@ from pipeline.core.compute import (
 from pipeline.core.memory import limit_memory, measure_memory, read_memory
 from pipeline.core.processes import (
     PACKAGE,
-    end_with,
     find_cache_folder,
     keep_current_folder_out,
     name_install,
@@ -113,6 +112,7 @@ else:
                 "Flags",
                 "Floats",
                 "Ints",
+                "RobustFit",
                 "find_scale",
                 "fit_robustly",
                 "group_rows",
@@ -129,7 +129,7 @@ else:
                 "spread_equal",
                 "student_quantile",
                 "turn_units",
-                "weigh",
+                "weigh_bounded",
             ),
             "machine_code": (
                 "LANES",

@@ -2,7 +2,8 @@
 
 import functools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -200,19 +201,18 @@ _GAUSSIAN = 1.4826
 _SHARE_OF_RMS = 0.5
 """Minimum robust spread of a column as a share of its RMS: for normal values the spread is the RMS, for
 values that are mostly zero it is zero."""
-_ROUNDS = 10
-"""Number of reweightings; five or twenty change no finding of three recordings
-(`make bench NAME=constants`)."""
-_WIDTH = 2.0
-"""Scale of Cauchy's weights in median sizes: 1.35 standard deviations of normal noise. Holland and Welsch use
-2.385; poses have more outliers. Half or double change no finding of three recordings."""
 _LEAST = 1e-9
 """Minimum spread, to keep quotients finite."""
 
 
+def find_median_size(values: Floats) -> float:
+    """Median absolute value."""
+    return float(np.median(np.abs(values)))
+
+
 def robust_spread(values: Floats) -> float:
     """Standard deviation about zero, estimated from the median absolute value."""
-    return _GAUSSIAN * float(np.median(np.abs(values)))
+    return _GAUSSIAN * find_median_size(values)
 
 
 def robust_spreads(values: Floats) -> Floats:
@@ -235,29 +235,6 @@ def guarded_spreads(values: Floats, clip: float = np.inf, least: float = _LEAST)
 def guarded_spread(values: Floats, clip: float = np.inf, least: float = _LEAST) -> float:
     """`guarded_spreads` of one column, shape (n,)."""
     return float(guarded_spreads(values[:, None], clip, least)[0])
-
-
-def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Robust linear regression: a minority of outliers has little weight.
-
-    Args:
-        design: columns, shape (n, p).
-        values: target, shape (n,).
-
-    Returns:
-        The coefficients, shape (p,), and the residuals, shape (n,).
-
-    Source: Holland and Welsch, Robust regression using iteratively reweighted least-squares, 1977.
-    """
-    weight = np.ones(values.size)
-    estimates: Floats = np.zeros(design.shape[1])
-    rest: Floats = values
-    for _ in range(_ROUNDS):
-        estimates = np.asarray(np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0])
-        rest = values - design @ estimates
-        size = np.abs(rest)
-        weight = 1.0 / np.sqrt(1.0 + (size / (_WIDTH * max(float(np.median(size)), _LEAST))) ** 2)
-    return estimates, rest
 
 
 @functools.lru_cache(maxsize=4096)
@@ -287,6 +264,13 @@ def jackknife_deviation(without: Floats) -> float:
 FREEDOM = 4.0
 LOG_PEAK = math.log(0.375)
 """Logarithm of the density at zero in units of the scale."""
+_ROUNDS = 10
+"""Number of reweightings; five or twenty change no finding of three recordings
+(`make bench NAME=constants`)."""
+_BOUND = 3.0
+"""Residual [scales] from which on its weight falls with its size (Huber)."""
+_RANK = 1e-12
+"""Share of the largest eigenvalue below which columns do not determine a coefficient."""
 
 
 def find_scale(rest: Floats) -> float:
@@ -308,8 +292,93 @@ def list_likelihoods(rest: Floats, scale: float | Floats | None = None) -> Float
     return made
 
 
-def weigh(rest: Floats, scale: float | None = None) -> Floats:
-    """Weight of every residual in a regression, shape (n,); by default with the scale that they have."""
-    scale = find_scale(rest) if scale is None else scale
+def weigh(rest: Floats, scale: float) -> Floats:
+    """Weight of every residual in a regression, shape (n,)."""
     made: Floats = (FREEDOM + 1.0) / (FREEDOM + (rest / scale) ** 2)
     return made
+
+
+def weigh_bounded(rest: Floats, scale: float) -> Floats:
+    """The same, with one for all near residuals and the same influence of all far ones (Huber)."""
+    made: Floats = np.minimum(1.0, _BOUND * scale / np.maximum(np.abs(rest), _LEAST))
+    return made
+
+
+class RobustFit(NamedTuple):
+    """A robust linear regression.
+
+    Attributes:
+        gains: coefficients, shape (p,).
+        rest: residuals, shape (n,).
+        weights: of the rows, shape (n,).
+        scale: of the residuals.
+    """
+
+    gains: Floats
+    rest: Floats
+    weights: Floats
+    scale: float
+
+    def find_errors(self, design: Floats, block: Ints) -> Floats:
+        """Standard errors of the coefficients that are robust to correlation within blocks, shape (p,).
+
+        Args:
+            design: columns, shape (n, p).
+            block: number of the block of every row, shape (n,).
+        """
+        inverse = np.linalg.pinv((design * self.weights[:, None]).T @ design)
+        pulls = np.column_stack(
+            [np.bincount(block, column * self.weights * self.rest) for column in design.T]
+        )
+        return np.asarray(np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 0.0)))
+
+
+def fit_robustly(
+    design: Floats,
+    values: Floats,
+    *,
+    measure: Callable[[Floats], float] = find_median_size,
+    weigh: Callable[[Floats, float], Floats] = weigh,
+    least: float = 0.0,
+    ridge: float = 0.0,
+    group: Ints | None = None,
+    rounds: int = _ROUNDS,
+) -> RobustFit:
+    """Robust linear regression: a minority of outliers has little weight.
+
+    Args:
+        design: columns, shape (n, p).
+        values: target, shape (n,).
+        measure: scale of residuals: `find_median_size` or `robust_spread`, its 1.5-fold, which no minority
+            moves, or `find_scale`, the likeliest.
+        weigh: weights of residuals of a scale: `weigh`, by which far ones count for nothing, or
+            `weigh_bounded`, by which they count as if they were near.
+        least: difference below which all fit alike, added to the scale in squares.
+        ridge: share of a column's power that is added to it: what few rows do not determine stays small.
+        group: number of the group of every row, each with an offset of its own, shape (n,).
+        rounds: number of reweightings, at least one.
+
+    Source: Holland and Welsch, Robust regression using iteratively reweighted least-squares, 1977.
+    """
+    size = np.sqrt(np.mean(design**2, axis=0)) + ridge
+    size[size == 0.0] = 1.0
+    scaled = design / size
+    columns, target = scaled, values
+    weights, gains, rest, scale = np.ones(values.size), np.zeros(size.size), values, 0.0
+    for _ in range(rounds):
+        if group is not None:
+            columns, target = _centre(scaled, group, weights), _centre(values[:, None], group, weights)[:, 0]
+        weighted = columns * weights[:, None]
+        normal = weighted.T @ columns + ridge * values.size * np.eye(size.size)
+        gains = np.asarray(np.linalg.lstsq(normal, weighted.T @ target, rcond=_RANK)[0], dtype=np.float64)
+        rest = target - columns @ gains
+        scale = max(math.hypot(measure(rest), least), _LEAST)
+        weights = weigh(rest, scale)
+    return RobustFit(gains / size, rest, weights, scale)
+
+
+def _centre(columns: Floats, group: Ints, weights: Floats) -> Floats:
+    """Columns without the weighted means of their groups, shape (n, p)."""
+    total = np.bincount(group, weights)
+    means = np.column_stack([np.bincount(group, weights * one) for one in columns.T]) / total[:, None]
+    return np.asarray(columns - means[group], dtype=np.float64)

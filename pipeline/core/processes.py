@@ -1,9 +1,7 @@
-"""The program and its processes: version, warnings, how Python is started, and when it ends."""
+"""The program and its processes: version, warnings, how Python is started."""
 
 import os
 import sys
-import threading
-import time
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -75,10 +73,6 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 """Environment variables with the number of threads of numerical libraries."""
 
 
-_ORPHAN_PERIOD_S = 0.5
-"""Period of checking for the parent process [s]: an orphan ends within it; a check takes microseconds."""
-
-
 def python_command(*words: str) -> list[str]:
     """Command line of this interpreter, by its absolute path, without the current folder in its import path.
 
@@ -99,18 +93,3 @@ def prepare_workers() -> None:
     for variable in _THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
     keep_current_folder_out()
-
-
-def end_with(parent: int) -> None:
-    """End this process when the one that started it is killed.
-
-    Args:
-        parent: id of that process.
-    """
-    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
-
-
-def _die_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_ORPHAN_PERIOD_S)
-    os._exit(1)

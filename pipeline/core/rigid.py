@@ -142,9 +142,6 @@ LONGEST_WAIT_S = 1.5
 """Longest time between two poses of a waiting localization [s]; above it, waiting and a vehicle at rest are
 not distinguishable. On the recordings 99 of 100 times are at most 1.2 s. Half and double change no finding of
 two recordings."""
-_REPEATED_SHARE = 0.2
-"""Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
-recordings have none, or 0.49 to 0.80."""
 _FEWEST_CORRECTIONS = 10
 """Minimum number of corrections of a localization for a period."""
 _RARE_S = 10.0
@@ -211,23 +208,6 @@ def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     stands = held & (next_fresh - times[previous] > longest_wait + ROUNDING_S)
     old_again = next_fresh - times < float(np.median(waits)) * 1.5 - ROUNDING_S
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
-
-
-def find_waits(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
-    """Short repeats of a pose while wheels turn: a localization that waits.
-
-    Args:
-        times: stamps of a segment's poses [s], shape (n,).
-        held: whether each pose repeats the previous one, shape (n,).
-        wheel_times: stamps of measured wheels [s], shape (m,).
-        turned: number of samples with turning wheels before each stamp, and in total, shape (m + 1,).
-    """
-    waits = np.zeros(times.size, dtype=bool)
-    first, end = np.array(find_runs(held), dtype=np.int64).reshape(-1, 2).T
-    low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
-    mostly = 2 * (turned[high] - turned[low]) > high - low
-    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= LONGEST_WAIT_S), end - first)
-    return waits
 
 
 def find_jumps(
@@ -357,13 +337,6 @@ def cut_segments(poses: pl.DataFrame) -> list[dict[str, NDArray[Any]]]:
     return [
         {name: values[rows] for name, values in columns.items()} for rows in group_rows(columns["segment"])
     ]
-
-
-def measure_repeats(poses: pl.DataFrame) -> float:
-    """Period of the stamps of table `poses` [s] if many of them repeat the pose before; else zero."""
-    held = poses["held"].mean()
-    repeated = isinstance(held, float) and held > _REPEATED_SHARE
-    return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
 
 
 def measure_period(times: Floats) -> float:

@@ -10,11 +10,11 @@ import polars as pl
 from pipeline.core import (
     FEWEST_OF_SPREAD,
     NORMAL_95,
-    STRETCH_S,
     Floats,
     Ints,
     group_rows,
     jackknife_deviation,
+    number_stretches,
     student_quantile,
 )
 from pipeline.estimation.commanded import measure_commanded_turn
@@ -133,18 +133,14 @@ def _measure_errors(fitted: Fitted) -> tuple[list[Estimate], float]:
     run_residuals = data.residuals_by_run[0]
     errors = run_residuals.find_horizon_errors(state.effects_of(0), state.timing[0])
     begin = run_residuals.run.start_s
-    stretch = _number(run_residuals.horizons.times[:, 0] - begin)
+    stretch = number_stretches(run_residuals.horizons.times[:, 0] - begin)
     asked = (data.whole.find_ideal()[:, 0] ** 2).sum(axis=1)
-    driven = _number(data.whole.times[:, 0] - begin)
+    driven = number_stretches(data.whole.times[:, 0] - begin)
     count = int(max(stretch.max(), driven.max())) + 1
     ideal = _sum(driven, asked, count)
     pace = math.sqrt(max(float(ideal[0].sum() / ideal[1].sum()), _LEAST_SQUARE))
     squares = (errors.position**2, errors.yaw**2)
     return [_compare(_sum(stretch, one, count), ideal) for one in squares], pace
-
-
-def _number(since: Floats) -> Ints:
-    return np.maximum(since / STRETCH_S, 0.0).astype(np.int64)
 
 
 def _sum(stretch: Ints, values: Floats, count: int) -> Floats:
@@ -184,7 +180,7 @@ def measure_slip(table: pl.DataFrame, source: Input) -> Estimate:
     modulus = np.maximum(rows["modulus"].to_numpy(), _LEAST_SLIP)
     if modulus.size == 0:
         return math.nan, math.nan
-    stretches = group_rows(_number(rows["t"].to_numpy() - float(rows["t"][0])))
+    stretches = group_rows(number_stretches(rows["t"].to_numpy() - float(rows["t"][0])))
     rng = np.random.default_rng(0)
     drawn = [
         np.median(modulus[np.concatenate([stretches[index] for index in picked])])

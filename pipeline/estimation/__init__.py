@@ -57,7 +57,7 @@ else:
                 "predict_from",
             ),
             "recordings": (
-                "Recording",
+                "DiagnosisInput",
                 "load_recording",
             ),
             "run_residuals": (

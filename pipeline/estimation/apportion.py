@@ -27,7 +27,7 @@ from pipeline.core import (
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, score
 from pipeline.estimation.ladder import ModelAssessment
-from pipeline.results import ABOVE_FLOOR, Moments, Share, SlipBudget, Span
+from pipeline.results import ABOVE_FLOOR, Moments, Share, SlipBudget, Stretch
 from pipeline.run import HORIZON_S
 
 Subset = frozenset[str]
@@ -227,7 +227,7 @@ def find_moments(assessment: ModelAssessment) -> tuple[Moments, ...]:
             known = np.isfinite(square)
             if known.any() and float(square[known].mean()) > (ABOVE_FLOOR * least) ** 2:
                 share, spans = find_half(stretch[known], square[known])
-                moments.append(Moments(quantity, share, tuple(Span(*span) for span in spans), number))
+                moments.append(Moments(quantity, share, tuple(Stretch(*span) for span in spans), number))
     return tuple(moments)
 
 

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.decision import Judged, Search, SearchResult
     from pipeline.estimation.estimation_data import EstimationData
-    from pipeline.estimation.recordings import Recording
+    from pipeline.estimation.recordings import DiagnosisInput
     from pipeline.models import FormulaEffect
 
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
@@ -98,7 +98,7 @@ class PathResult:
         return next((one for name, one in self.outcome.judged.items() if name in effect.searched_as), None)
 
 
-def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -> RunDiagnosis:
+def refuse(recording: DiagnosisInput, source: str, recordings: Sequence[DiagnosisInput]) -> RunDiagnosis:
     """The diagnosis of a run for which a fit is meaningless."""
     return RunDiagnosis(
         recording.name,
@@ -227,7 +227,7 @@ def _begin(assessment: ModelAssessment, undecided: Sequence[Undecided]) -> Model
 
 
 def of_run(
-    common: RunDiagnosis, recording: Recording, number: int, delays: Delays, data: EstimationData
+    common: RunDiagnosis, recording: DiagnosisInput, number: int, delays: Delays, data: EstimationData
 ) -> RunDiagnosis:
     """The common diagnosis with the name, findings and delays of one run."""
     effects = tuple(

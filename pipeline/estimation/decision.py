@@ -29,7 +29,7 @@ from pipeline.estimation.fit import (
     whiten,
 )
 from pipeline.estimation.intervals import find_covariance
-from pipeline.estimation.matrix import Change, Matrix
+from pipeline.estimation.matrix import Matrix, Move
 from pipeline.estimation.model_state import combine_columns, pick_columns
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.plausibility import is_nameable, is_possible, is_too_small
@@ -136,7 +136,7 @@ def _find_price(state: ModelState, numbers: int) -> float:
 
 
 @dataclass(frozen=True)
-class Rival:
+class Alternative:
     """Another effect in the place of one that was chosen.
 
     Attributes:
@@ -169,7 +169,7 @@ class SearchResult:
     final: PathFit
     new: tuple[str, ...]
     judged: dict[str, Judged]
-    rivals: tuple[Rival, ...]
+    rivals: tuple[Alternative, ...]
     matrix: Matrix
 
 
@@ -286,7 +286,7 @@ class Search:
                 return self._simplify(best[1], noise)
         return None
 
-    def _look(self, matrix: Matrix, change: Change) -> tuple[float, tuple[str, ...], ModelState]:
+    def _look(self, matrix: Matrix, change: Move) -> tuple[float, tuple[str, ...], ModelState]:
         """Cost of a set at first sight, at the best of its starts, with its name."""
         looks: list[tuple[float, int, ModelState]] = []
         for state in matrix.list_states(change):
@@ -495,12 +495,14 @@ class Search:
         matrix = Matrix(fit, (), self.conditions.largest)
         return {one.id: judge(fit, one, matrix, self.conditions, self.least_t) for one in asked}
 
-    def _list_rivals(self, final: PathFit, matrix: Matrix, judged: dict[str, Judged]) -> Iterator[Rival]:
+    def _list_rivals(
+        self, final: PathFit, matrix: Matrix, judged: dict[str, Judged]
+    ) -> Iterator[Alternative]:
         """Effects as good as one that is named, or better in a tenth of resampled recordings."""
         own = _sum_blocks(final, final.noise)
         weights = _resample(own.size)
         for name in (name for name, one in judged.items() if not one.refusal):
-            brings = matrix.expect_change(Change().drop(name))
+            brings = matrix.expect_change(Move().drop(name))
             others = [
                 one
                 for one in matrix.list_replacements(name)
@@ -520,7 +522,7 @@ class Search:
                 apart = find_cost(fit) - find_cost(final)
                 is_often = float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN
                 if apart < EQUAL or (is_often and apart < _FAR):
-                    yield Rival(name, other, fit, apart)
+                    yield Alternative(name, other, fit, apart)
 
 
 def _fit_under(
@@ -606,7 +608,7 @@ def judge(
     """
     path, (base, is_linear) = fit.path, _drop_effect(fit, effect.id, matrix.without[effect.id])
     if is_linear:
-        frequency = _find_frequency(matrix, Change(), Change().drop(effect.id))
+        frequency = _find_frequency(matrix, Move(), Move().drop(effect.id))
     else:
         brings = _sum_blocks(base, fit.noise) - _sum_blocks(fit, fit.noise)
         price = _find_price(fit.state, fit.numbers) - _find_price(base.state, base.numbers)
@@ -643,7 +645,7 @@ def judge(
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
 
 
-def _find_frequency(matrix: Matrix, change: Change, without: Change) -> float:
+def _find_frequency(matrix: Matrix, change: Move, without: Move) -> float:
     """Share of resampled recordings in which what a set has beyond another pays for its numbers."""
     brings = matrix.sum_blocks(without) - matrix.sum_blocks(change)
     return _count_paying(brings, matrix.find_price(change) - matrix.find_price(without))

@@ -19,7 +19,7 @@ from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.encoder_scale import find_encoder_scale
 from pipeline.estimation.estimation_data import DiagnosisError, EstimationData, prepare_data
 from pipeline.estimation.model_state import ModelState
-from pipeline.estimation.recordings import Recording
+from pipeline.estimation.recordings import DiagnosisInput
 from pipeline.estimation.run_residuals import Input, InputChoice, choose_input
 from pipeline.estimation.together import Member, judge_together
 from pipeline.estimation.unexplained import search_formula
@@ -46,7 +46,7 @@ def parse_budget(text: str) -> float:
 
 
 def diagnose_runs(
-    recordings: Sequence[Recording],
+    recordings: Sequence[DiagnosisInput],
     vehicle: Vehicle,
     *,
     inputs: Sequence[str] = ("command", "measured"),
@@ -130,7 +130,7 @@ def _search_path(data: EstimationData, search: Search, name: str, start: ModelSt
 
 
 def _conclude(
-    recordings: Sequence[Recording],
+    recordings: Sequence[DiagnosisInput],
     data: EstimationData,
     chosen: InputChoice,
     results: Sequence[PathResult],

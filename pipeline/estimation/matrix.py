@@ -51,7 +51,7 @@ _CLAMPED = 4
 
 
 @dataclass(frozen=True)
-class Change:
+class Move:
     """A set of effects, as what changes in a model.
 
     Attributes:
@@ -62,17 +62,17 @@ class Change:
     gone: frozenset[str] = frozenset()
     added: tuple[int, ...] = ()
 
-    def drop(self, *names: str) -> Change:
+    def drop(self, *names: str) -> Move:
         """The change with more effects gone."""
-        return Change(self.gone.union(names), self.added)
+        return Move(self.gone.union(names), self.added)
 
-    def add(self, *trials: int) -> Change:
+    def add(self, *trials: int) -> Move:
         """The change with more trials."""
-        return Change(self.gone, tuple(sorted((*self.added, *trials))))
+        return Move(self.gone, tuple(sorted((*self.added, *trials))))
 
-    def without(self, *trials: int) -> Change:
+    def without(self, *trials: int) -> Move:
         """The change without some trials."""
-        return Change(self.gone, tuple(one for one in self.added if one not in trials))
+        return Move(self.gone, tuple(one for one in self.added if one not in trials))
 
 
 class Matrix:
@@ -114,7 +114,7 @@ class Matrix:
         self._white: Floats = white / self._deviation
         self._gram: Floats = self._white.T @ self._white
         self._bounds = self._find_bounds()
-        self._solved: dict[Change, tuple[float, Floats]] = {}
+        self._solved: dict[Move, tuple[float, Floats]] = {}
 
     @property
     def noise(self) -> Noise:
@@ -163,16 +163,16 @@ class Matrix:
                     low[column], high[column] = (bound - value for bound in parameter.bounds)
         return low, high
 
-    def add(self, *trials: int, to: Change = Change()) -> Change:
+    def add(self, *trials: int, to: Move = Move()) -> Move:
         """A set with trials, in the place of what they replace."""
         return to.drop(*(name for index in trials for name in self.trials[index].replaces)).add(*trials)
 
-    def name(self, change: Change) -> tuple[str, ...]:
+    def name(self, change: Move) -> tuple[str, ...]:
         """Ids of the effects of a set."""
         stay = [name for name in self.fit.ids if name not in change.gone]
         return tuple(sorted([*stay, *(self.trials[index].effect.id for index in change.added)]))
 
-    def find_price(self, change: Change) -> float:
+    def find_price(self, change: Move) -> float:
         """What the numbers and unusual effects of a set must bring."""
         stay = [effect for effect in self.fit.state.effects if effect.id not in change.gone]
         ids = {*(effect.id for effect in stay)} | (set() if self._brings_dead_time(change) else {""})
@@ -180,26 +180,26 @@ class Matrix:
         own = PRICE * numbers + sum(map(find_rarity, stay))
         return own + sum(self.trials[index].price for index in change.added)
 
-    def measure(self, change: Change) -> float:
+    def measure(self, change: Move) -> float:
         """Expected cost of a set with its price; infinite where it cannot be."""
         return self._solve(change)[0]
 
-    def expect_change(self, change: Change) -> float:
+    def expect_change(self, change: Move) -> float:
         """Expected change of the cost."""
-        return self.measure(change) - self.measure(Change())
+        return self.measure(change) - self.measure(Move())
 
-    def _list_columns(self, change: Change) -> Ints:
+    def _list_columns(self, change: Move) -> Ints:
         ids = [name for name in self.fit.ids if name not in change.gone]
         ids += [] if self._brings_dead_time(change) else [""]
         own = [self._first + index for name in ids for index in self._own.get(name, ())]
         return np.array([*own, *(c for i in change.added for c in self._moved[i].tolist())], dtype=np.int64)
 
-    def _brings_dead_time(self, change: Change) -> bool:
+    def _brings_dead_time(self, change: Move) -> bool:
         """Whether a delay of the commands comes that takes over those of the encoders."""
         late = (self.trials[index].effect.late for index in change.added)
         return not self.fit.path.is_delayed and Late.COMMANDS in late
 
-    def _aim(self, change: Change) -> Floats:
+    def _aim(self, change: Move) -> Floats:
         """What the columns of a set must explain: the residual with what goes taken out, shape (q,)."""
         aim = np.zeros(self._gram.shape[0])
         whole = [index for index in change.added if self.trials[index].replaces]
@@ -208,13 +208,13 @@ class Matrix:
         aim[[int(self._places[index][-1]) for index in whole]] = -1.0
         return aim
 
-    def _solve(self, change: Change) -> tuple[float, Floats]:
+    def _solve(self, change: Move) -> tuple[float, Floats]:
         """Expected cost of a set, and the step of its columns."""
         if change not in self._solved:
             self._solved[change] = self._solve_anew(change)
         return self._solved[change]
 
-    def _solve_anew(self, change: Change) -> tuple[float, Floats]:
+    def _solve_anew(self, change: Move) -> tuple[float, Floats]:
         trials = [self.trials[index] for index in change.added]
         if any(self._is_in(one, change) for one in trials):
             return math.inf, np.zeros(0)
@@ -237,7 +237,7 @@ class Matrix:
                 return math.inf, step
         return cost - float(2.0 * scaled @ pull - scaled @ (normal @ scaled)), step
 
-    def _is_in(self, trial: Trial, change: Change) -> bool:
+    def _is_in(self, trial: Trial, change: Move) -> bool:
         """Whether a trial contains what stays, or is a special case of what comes."""
         ids = self.name(change)
         others = (self.trials[index].effect for index in change.added)
@@ -261,10 +261,10 @@ class Matrix:
                 moved[free] = np.linalg.solve(normal[np.ix_(free, free)], rest)
         return np.clip(moved, low, high) if held.any() else moved
 
-    def _count_new(self, change: Change) -> int:
+    def _count_new(self, change: Move) -> int:
         return sum(self._moved[index].size for index in change.added)
 
-    def _split(self, step: Floats, change: Change) -> Iterator[tuple[float, ...]]:
+    def _split(self, step: Floats, change: Move) -> Iterator[tuple[float, ...]]:
         """The part of a step of each trial."""
         begin = step.size - self._count_new(change)
         for index in change.added:
@@ -272,7 +272,7 @@ class Matrix:
             yield tuple(step[begin:end].tolist())
             begin = end
 
-    def list_states(self, change: Change) -> list[ModelState]:
+    def list_states(self, change: Move) -> list[ModelState]:
         """The set at its expected values; where a number acts by a secant, also at the whole and at half."""
         step = self._solve(change)[1]
         state = self.fit.state.drop(change.gone) if change.gone else self.fit.state
@@ -298,17 +298,17 @@ class Matrix:
         return made
 
     @cached_property
-    def _leading(self) -> list[Change]:
+    def _leading(self) -> list[Move]:
         """The best start of each candidate, the best candidate first; impossible ones last."""
         return self._pick(sorted(map(self.add, range(len(self.trials))), key=self.measure))
 
-    def list_singles(self) -> list[Change]:
+    def list_singles(self) -> list[Move]:
         """The best start of each candidate that is possible, the best candidate first."""
         return [one for one in self._leading if math.isfinite(self.measure(one))]
 
-    def list_replacements(self, name: str) -> list[Change]:
+    def list_replacements(self, name: str) -> list[Move]:
         """The best start of each candidate in the place of an effect, the best candidate first."""
-        changes = [self.add(index, to=Change().drop(name)) for index in range(len(self.trials))]
+        changes = [self.add(index, to=Move().drop(name)) for index in range(len(self.trials))]
         first = self._pick(sorted(changes, key=self.measure))
         return [one for one in first if math.isfinite(self.measure(one))]
 
@@ -317,7 +317,7 @@ class Matrix:
         given: Collection[str],
         banned: Collection[tuple[str, ...]] = (),
         excluded: Collection[str] = (),
-    ) -> list[Change]:
+    ) -> list[Move]:
         """Sets that promise less cost, the best first: those on the way of steepest moves, and others near.
 
         Args:
@@ -325,8 +325,8 @@ class Matrix:
             banned: names of sets that are not chosen.
             excluded: ids of effects that are in none.
         """
-        start, now = self.measure(Change()), Change().drop(*{*self.fit.ids}.intersection(excluded))
-        steps, seen = list[Change](), {now}
+        start, now = self.measure(Move()), Move().drop(*{*self.fit.ids}.intersection(excluded))
+        steps, seen = list[Move](), {now}
         while True:
             moves = dict.fromkeys(self._list_moves(now, given, excluded))
             seen.update(moves)
@@ -340,14 +340,14 @@ class Matrix:
         chosen = self._pick((*steps, *self._pick(single)[:_BESIDE], *paying))
         return [one for one in chosen if self.name(one) not in banned]
 
-    def _pick(self, changes: Iterable[Change]) -> list[Change]:
+    def _pick(self, changes: Iterable[Move]) -> list[Move]:
         """The first of each set."""
-        first: dict[tuple[str, ...], Change] = {}
+        first: dict[tuple[str, ...], Move] = {}
         for one in changes:
             first.setdefault(self.name(one), one)
         return list(first.values())
 
-    def _list_moves(self, now: Change, given: Collection[str], excluded: Collection[str]) -> Iterator[Change]:
+    def _list_moves(self, now: Move, given: Collection[str], excluded: Collection[str]) -> Iterator[Move]:
         """What one move makes of a set: drop, add, exchange, one for two, two, a whole for its parts."""
         ids = [trial.effect.id for trial in self.trials]
         stay = [name for name in self.fit.ids if name not in now.gone and name not in given]
@@ -359,7 +359,7 @@ class Matrix:
             yield rest
             yield from (self.add(other, to=rest) for other in range(len(ids)) if ids[other] == ids[index])
             yield from (self.add(other, to=rest) for other in new)
-        yield from (Change(now.gone - {name}, now.added) for name in now.gone.difference(excluded))
+        yield from (Move(now.gone - {name}, now.added) for name in now.gone.difference(excluded))
         yield from (self.add(index, to=now) for index in new)
         for name in stay:
             yield now.drop(name)
@@ -378,7 +378,7 @@ class Matrix:
             if len(parts) > 1:
                 yield self.add(index, to=now.drop(*parts))
 
-    def sum_blocks(self, change: Change) -> Floats:
+    def sum_blocks(self, change: Move) -> Floats:
         """Expected cost of a set in each block, without price, shape (blocks,)."""
         columns, aim = self._list_columns(change), self._aim(change)
         aim[columns] -= self._solve(change)[1]

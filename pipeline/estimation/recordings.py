@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Recording:
+class DiagnosisInput:
     """One run as processed by the stages.
 
     Attributes:
@@ -40,6 +40,6 @@ class Recording:
         return () if table is None else read_finding_table(table)
 
 
-def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
+def load_recording(recording: DiagnosisInput, vehicle: Vehicle) -> MotionRun:
     """The run as arrays."""
     return load_run(recording.tables, vehicle, name=recording.name, sha256=recording.sha256)

@@ -62,8 +62,8 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Difference of two errors, with its 95 % interval."""
+class LossDifference:
+    """LossDifference of two errors, with its 95 % interval."""
 
     value: float
     low: float
@@ -91,8 +91,8 @@ class Contest:
         """The model with the smallest error."""
         return min(self.rivals, key=lambda rival: (math.isnan(rival.read(metric)), rival.read(metric)))
 
-    def measure(self, rival: Rival, other: Rival, metric: str) -> Difference:
-        """Difference of the errors of a model and of another one."""
+    def measure(self, rival: Rival, other: Rival, metric: str) -> LossDifference:
+        """LossDifference of the errors of a model and of another one."""
         return compare_errors(rival.list_errors(metric), other.list_errors(metric), self.stretches)
 
     def list_ties(self, metric: str) -> list[Rival]:
@@ -131,8 +131,8 @@ def hold_contest(data: EstimationData, rivals: Sequence[Rival]) -> Contest:
     return Contest(tuple(rivals), np.concatenate(number_predictions(data)))
 
 
-def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
-    """Difference of two root mean squares over the same predictions, by a jackknife over stretches.
+def compare_errors(one: Floats, other: Floats, stretches: Ints) -> LossDifference:
+    """LossDifference of two root mean squares over the same predictions, by a jackknife over stretches.
 
     Args:
         one: errors, shape (n,); NaN without a prediction.
@@ -141,18 +141,18 @@ def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
     """
     known = np.isfinite(one) & np.isfinite(other)
     if not known.any():
-        return Difference(math.nan, math.nan, math.nan)
+        return LossDifference(math.nan, math.nan, math.nan)
     index = np.unique(stretches[known], return_inverse=True)[1]
     counts = np.bincount(index).astype(np.float64)
     sums = np.array([np.bincount(index, errors[known] ** 2) for errors in (one, other)])
     first, second = np.sqrt(sums.sum(axis=1) / counts.sum()).tolist()
     value = first - second
     if counts.size < 2:  # noqa: PLR2004 - one stretch has no spread
-        return Difference(value, -math.inf, math.inf)
+        return LossDifference(value, -math.inf, math.inf)
     without = np.sqrt((sums.sum(axis=1)[:, None] - sums) / (counts.sum() - counts))
     moved = without[0] - without[1]
     half = student_quantile(CONFIDENCE, counts.size - 1) * jackknife_deviation(moved)
-    return Difference(value, value - half, value + half)
+    return LossDifference(value, value - half, value + half)
 
 
 def contest_as_json(contest: Contest) -> dict[str, object]:

@@ -37,7 +37,7 @@ from pipeline.store import (
 from schemas import contract_of
 
 if TYPE_CHECKING:
-    from pipeline.estimation.recordings import Recording
+    from pipeline.estimation.recordings import DiagnosisInput
     from pipeline.models import Model, ModelFile
 
 
@@ -227,7 +227,7 @@ def diagnose_stored(
     return diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs[0]
 
 
-def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
+def read_recording(manifest: Manifest) -> tuple[Vehicle, DiagnosisInput]:
     """Vehicle and input data of a diagnosis from a stored run.
 
     Raises:
@@ -247,12 +247,12 @@ def _make_recording(
     tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
     log: Mapping[str, JSON],
     length_scale_m: float,
-) -> Recording:
+) -> DiagnosisInput:
     """Tables for a diagnosis, with their origin."""
-    from pipeline.estimation.recordings import Recording  # noqa: PLC0415 - heavy
+    from pipeline.estimation.recordings import DiagnosisInput  # noqa: PLC0415 - heavy
 
     names, read = tables
-    return Recording(
+    return DiagnosisInput(
         run,
         {name: read(name) for name in names if name in _TABLES},
         sha256=str(log.get("sha256", "")),

@@ -18,7 +18,7 @@ from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation.recordings import Recording
+    from pipeline.estimation.recordings import DiagnosisInput
     from pipeline.sources import Vehicle
 
 
@@ -31,12 +31,12 @@ class Member:
         run: the same as arrays.
     """
 
-    recording: Recording
+    recording: DiagnosisInput
     run: MotionRun
 
 
 def judge_together(
-    recordings: Sequence[Recording],
+    recordings: Sequence[DiagnosisInput],
     vehicle: Vehicle,
     source: str,
     judge: Callable[[Sequence[Member]], Diagnosis],
@@ -84,14 +84,14 @@ def judge_together(
 
 
 def _leave_out(
-    recording: Recording, source: str, recordings: Sequence[Recording], error: SlipError
+    recording: DiagnosisInput, source: str, recordings: Sequence[DiagnosisInput], error: SlipError
 ) -> RunDiagnosis:
     finding = Finding(error.code, "warning", "diagnosis", {"kind": "left out", "error": error.what})
     refused = refuse(recording, source, recordings)
     return msgspec.structs.replace(refused, findings=(finding, *refused.findings))
 
 
-def _excuse(recordings: Sequence[Recording], vehicle: Vehicle) -> Mapping[str, Finding]:
+def _excuse(recordings: Sequence[DiagnosisInput], vehicle: Vehicle) -> Mapping[str, Finding]:
     """What a finding of a wrong wheel radius is where other runs contradict that radius, by run."""
     gains, claimed = list[float](), dict[str, float]()
     for recording in recordings:

@@ -48,7 +48,7 @@ _STEPS = 400
 
 
 @dataclass(frozen=True)
-class Samples:
+class ErrorSamples:
     """Held-out errors of the predictions of runs at one time ahead.
 
     Attributes:
@@ -162,7 +162,7 @@ def _fit_band(speed: Floats, error: Floats) -> _Band:
     return _Band(fitted, float(ratio[min(index, ratio.size - 1)]))
 
 
-def find_speed_limit(samples: Samples, tolerance: float, *, seed: int = 0) -> SpeedLimit:
+def find_speed_limit(samples: ErrorSamples, tolerance: float, *, seed: int = 0) -> SpeedLimit:
     """Highest speed at which 95 % of the predictions are within a tolerance.
 
     Args:
@@ -195,7 +195,7 @@ def find_speed_limit(samples: Samples, tolerance: float, *, seed: int = 0) -> Sp
 
 
 def _resample(
-    samples: Samples, tolerance: float, ends: tuple[float, float], rng: np.random.Generator
+    samples: ErrorSamples, tolerance: float, ends: tuple[float, float], rng: np.random.Generator
 ) -> tuple[float, float]:
     """95 % interval of the speed over stretches drawn with replacement; no speed counts as the slowest."""
     order = np.argsort(samples.stretch, kind="stable")
@@ -257,7 +257,7 @@ def limits_as_json(limits: Mapping[str, SpeedLimit]) -> list[dict[str, object]]:
 
 def gather_samples(
     file: ModelFile, runs: Sequence[MotionRun], source: Input, ahead_s: float = HORIZON_S
-) -> Samples:
+) -> ErrorSamples:
     """Errors of a model's predictions on runs, none from a fit that has seen the same ten seconds.
 
     On a run that the model was fitted to, its effects are fitted again without each tested stretch, and a
@@ -278,7 +278,7 @@ def gather_samples(
         hint = "A tolerance at another time ahead cannot be judged: choose one in this range."
         raise MotionError("too_far_ahead", what, where="--ahead", hint=hint)
     known = {row.get("run") for row in file.list_fitted("runs")}
-    parts: list[Samples] = []
+    parts: list[ErrorSamples] = []
     seen = 0
     for run in runs:
         data = EstimationData([run], file.model.vehicle, source)
@@ -287,14 +287,14 @@ def gather_samples(
         else:
             fitted = fit_as_it_is(data, file.model, file.per_run)
         part = _hold_out_at(data, fitted, ahead_s)
-        parts.append(Samples(part.speed, part.error, part.stretch + seen))
+        parts.append(ErrorSamples(part.speed, part.error, part.stretch + seen))
         seen = int(parts[-1].stretch.max(initial=seen)) + 1
-    return Samples(
+    return ErrorSamples(
         *(np.concatenate([getattr(one, name) for one in parts]) for name in ("speed", "error", "stretch"))
     )
 
 
-def _hold_out_at(data: EstimationData, fitted: Fitted, ahead_s: float) -> Samples:
+def _hold_out_at(data: EstimationData, fitted: Fitted, ahead_s: float) -> ErrorSamples:
     """Held-out errors of one run's predictions at a time ahead."""
     (run_residuals,), whole = data.residuals_by_run, data.whole
     rows = _find_rows(run_residuals, ahead_s)
@@ -317,7 +317,7 @@ def _hold_out_at(data: EstimationData, fitted: Fitted, ahead_s: float) -> Sample
     # Poses are not exactly at the time ahead: over tenths of a second, errors grow in proportion to it.
     error *= ahead_s / since
     stretches = number_predictions(data)[0][rows]
-    return Samples(speed[known], error[known], stretches[known])
+    return ErrorSamples(speed[known], error[known], stretches[known])
 
 
 def _find_fastest(moved: Floats, edges: Ints, step_s: float) -> Floats:

@@ -192,7 +192,7 @@ def find_live(ideal: Floats) -> Flags:
 
 
 @dataclass(frozen=True)
-class Spans:
+class WindowSpans:
     """Starts and ends of windows relative to cell edges: edge before, share of the cell and width [s]."""
 
     first: Ints
@@ -214,17 +214,17 @@ class Spans:
         )
 
 
-def locate_windows(run_residuals: RunResiduals, late: float = 0.0) -> Spans:
+def locate_windows(run_residuals: RunResiduals, late: float = 0.0) -> WindowSpans:
     """The windows of a comparison, moved ``late`` seconds back, relative to its cell edges."""
     grid, times = run_residuals.grid, run_residuals.windows.times
     start, end = grid.locate_edges(times[:, 0] - late), grid.locate_edges(times[:, 1] - late)
     top = grid.times.size - 1
     first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)
     width = np.maximum((end - start) * grid.step_s, grid.step_s)
-    return Spans(first, start - first, last, end - last, width)
+    return WindowSpans(first, start - first, last, end - last, width)
 
 
-def average_windows(run_residuals: RunResiduals, velocity: Velocity, spans: Spans) -> Floats:
+def average_windows(run_residuals: RunResiduals, velocity: Velocity, spans: WindowSpans) -> Floats:
     """Mean of (x, y, w) over every window, shape (n, 3)."""
     means, y = np.zeros((spans.first.size, 3)), velocity.y
     means[:, 0] = spans.average(run_residuals, velocity.x)

@@ -9,7 +9,7 @@ from typing import Any, Final
 from mcap.records import Channel, Schema
 
 from pipeline.core import format_size, name_first
-from pipeline.logs.chunks import Span, SpanKind, largest_plausible
+from pipeline.logs.chunks import ByteSpan, SpanKind, largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
 
@@ -75,7 +75,7 @@ class Catalog:
     bare: set[tuple[type, int]] = field(default_factory=set)
     contradicted: set[tuple[type, int]] = field(default_factory=set)
     repeated: list[Schema | Channel] = field(default_factory=list)
-    spans: list[Span] = field(default_factory=list)
+    spans: list[ByteSpan] = field(default_factory=list)
     compressions: set[str] = field(default_factory=set)
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     attachments: list[str] = field(default_factory=list)
@@ -163,8 +163,8 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
     total = sum(_work(span.inflated, span.length) for span in catalog.spans)
     if total <= allowed:
         return
-    within: list[Span] = []
-    omitted: list[Span] = []
+    within: list[ByteSpan] = []
+    omitted: list[ByteSpan] = []
     taken = 0
     for span in catalog.spans:
         work = _work(span.inflated, span.length)
@@ -193,7 +193,7 @@ def _work(inflated: int, stored: int) -> int:
     return inflated if inflated <= largest_plausible(stored) else 0
 
 
-def _range_of(spans: Sequence[Span]) -> tuple[int | None, int | None]:
+def _range_of(spans: Sequence[ByteSpan]) -> tuple[int | None, int | None]:
     """First and last known log time of spans [ns]."""
     starts = (span.start_ns for span in spans if span.start_ns is not None)
     ends = (span.end_ns for span in spans if span.end_ns is not None)

@@ -191,7 +191,7 @@ class SpanKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class ByteSpan:
     """A range of the file that contains messages: a chunk, or message records outside chunks.
 
     Attributes:

@@ -314,9 +314,12 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
 
 
 def list_files(folder: Path) -> list[Path]:
-    """The files of recordings in a folder, MCAP first, by name and number."""
+    """The files of recordings in a folder, MCAP first, by name and number.
+
+    Whoever lists a folder opens what it holds: pipes, sockets, devices and dead links are no files.
+    """
     named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=split_number))
-    return [file for file in named if not file.is_dir()]
+    return [file for file in named if file.is_file()]
 
 
 def stem_of(file: Path) -> str:

@@ -24,7 +24,7 @@ from pipeline.core import guess_names
 from pipeline.logs import records as rec
 from pipeline.logs.bags import catalog_bag
 from pipeline.logs.catalog import Catalog, keep_within
-from pipeline.logs.chunks import Span, SpanKind
+from pipeline.logs.chunks import ByteSpan, SpanKind
 from pipeline.logs.compressed import COMPRESSED, open_inflated
 from pipeline.logs.foreign import LONGEST_START, name_foreign
 from pipeline.logs.records import (
@@ -180,7 +180,7 @@ class _DamagedSummaryError(_NoSummaryError):
 class _Summary(NamedTuple):
     start: int
     statistics: Statistics
-    chunks: list[Span]
+    chunks: list[ByteSpan]
     side_records: set[tuple[int, int, str]]
 
 
@@ -339,7 +339,7 @@ def _read_summary(source: ByteSource, catalog: Catalog, threads: int) -> _Summar
             raise _NoSummaryError(f"the summary does not {missing}")
     catalog.compressions = {chunk.compression for chunk in chunks}
     spans = [
-        Span(
+        ByteSpan(
             SpanKind.CHUNK,
             chunk.chunk_start_offset,
             chunk.chunk_length,
@@ -381,13 +381,13 @@ def _parse_summary(body: memoryview) -> defaultdict[type, list[Any]]:
     return records
 
 
-def _compare_summary(source: ByteSource, catalog: Catalog, spans: Sequence[Span], threads: int) -> None:
+def _compare_summary(source: ByteSource, catalog: Catalog, spans: Sequence[ByteSpan], threads: int) -> None:
     """Compare a summary without a checksum with the chunks that it lists, and those in which channels begin.
 
     Recorders repeat the records of a channel there.
     """
     sought = set(catalog.channels)
-    chosen: list[Span] = []
+    chosen: list[ByteSpan] = []
     for span in spans:
         head = rec.HEAD.pack(rec.CHUNK, span.length - rec.HEAD_SIZE)
         if source.read_at(span.offset, rec.HEAD_SIZE) != head:
@@ -406,14 +406,14 @@ def _add_descriptions(catalog: Catalog, loaded: Loaded) -> None:
         catalog.add_description(record, covered=not loaded.unchecked)
 
 
-def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
+def _forget_chunk(span: ByteSpan, loaded: Loaded) -> tuple[ByteSpan, Loaded]:
     return span, replace(loaded, chunk=b"")
 
 
 def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
     """Inflate every span to determine what no index states: channels, counts, times."""
     catalog.counts = {}
-    examined: list[Span] = []
+    examined: list[ByteSpan] = []
     losses = dict.fromkeys(catalog.losses)
     numbered: list[Numbered] = []
     for span, loaded in load_spans(source, catalog.spans, _forget_chunk, threads=threads):

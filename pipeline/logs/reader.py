@@ -16,7 +16,7 @@ from pipeline.logs.bags import read_database
 from pipeline.logs.catalog import Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
-from pipeline.logs.chunks import Span, SpanKind
+from pipeline.logs.chunks import ByteSpan, SpanKind
 from pipeline.logs.columns import (
     STAMPS,
     Column,
@@ -419,7 +419,7 @@ def _read_part(source: ByteSource, part: Part, wanted: set[int], threads: int) -
         held = read_database(part.path, part.catalog, own, most) if own else ()
         return (_gather_rows(part, payloads, losses) for payloads, losses in held)
 
-    def gather(span: Span, loaded: Loaded) -> _Gathered:
+    def gather(span: ByteSpan, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
         # A cut chunk at the end of a file is already reported as a loss.
@@ -436,7 +436,7 @@ def _gather_rows(part: Part, payloads: Mapping[int, Payloads], losses: list[Loss
     return _Gathered(merged, losses, stretch, stretch, index_damaged=False)
 
 
-def _spans_with(part: Part, own: set[int]) -> list[Span]:
+def _spans_with(part: Part, own: set[int]) -> list[ByteSpan]:
     return [span for span in part.catalog.spans if span.channels is None or span.channels & own]
 
 
@@ -455,7 +455,9 @@ def _find_repeated(
         own = {number for number, merged in part.numbers.items() if merged in jobs}
         asked = {number: times[part.numbers[number]] for number in own if part.numbers[number] in times}
 
-        def digest(_span: Span, loaded: Loaded, asked: Mapping[int, Ints] = asked) -> dict[int, list[Key]]:
+        def digest(
+            _span: ByteSpan, loaded: Loaded, asked: Mapping[int, Ints] = asked
+        ) -> dict[int, list[Key]]:
             return digest_messages(loaded.chunk, loaded.messages, asked)
 
         for keys_of in load_spans(source, _spans_with(part, own), digest, threads=threads):

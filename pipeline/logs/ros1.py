@@ -14,7 +14,7 @@ from mcap.records import Channel, Schema
 from pipeline.core import Ints, format_count
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
-from pipeline.logs.chunks import Messages, Span, SpanKind, inflate
+from pipeline.logs.chunks import ByteSpan, Messages, SpanKind, inflate
 from pipeline.logs.records import Buffer, ByteSource, Loss
 
 _WORD: Final = struct.Struct("<I")
@@ -110,7 +110,7 @@ def catalog_ros1(source: ByteSource, catalog: Catalog) -> None:
         except (struct.error, KeyError, rec.RecordError):
             pass  # reading it says so
         numbers = frozenset(counts) & catalog.channels.keys()
-        span = Span(SpanKind.BAG_CHUNK, start, stop - start, 0, first, last, numbers, inflated)
+        span = ByteSpan(SpanKind.BAG_CHUNK, start, stop - start, 0, first, last, numbers, inflated)
         catalog.spans.append(span)
         if numbers:
             catalog.add_times(first, last)
@@ -118,7 +118,7 @@ def catalog_ros1(source: ByteSource, catalog: Catalog) -> None:
             catalog.counts[number] += counts[number]
 
 
-def load_ros1(span: Span, blob: Buffer) -> tuple[Buffer, Messages, list[Loss]]:
+def load_ros1(span: ByteSpan, blob: Buffer) -> tuple[Buffer, Messages, list[Loss]]:
     """Content, messages and losses of a chunk with the index after it.
 
     Raises:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import Ints, group_rows, name_first
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
-from pipeline.logs.chunks import FIRST_PRIVATE, Span, SpanKind
+from pipeline.logs.chunks import FIRST_PRIVATE, ByteSpan, SpanKind
 from pipeline.logs.records import ByteSource, Loss
 
 _FIRST_WINDOW: Final = 1 << 12
@@ -64,7 +64,7 @@ class Scanner:
         self._catalog = catalog
         self._last_ns: int | None = None
 
-    def scan(self, start: int, stop: int, listed: Sequence[Span]) -> None:
+    def scan(self, start: int, stop: int, listed: Sequence[ByteSpan]) -> None:
         """Take the listed chunks, and scan the records in [start, stop) that they leave.
 
         Damage is recorded as a loss and skipped.
@@ -112,7 +112,7 @@ class Scanner:
             ):
                 catalog.spans[-1] = replace(last, length=after - last.offset)
             else:
-                catalog.spans.append(Span(SpanKind.LOOSE, position, after - position))
+                catalog.spans.append(ByteSpan(SpanKind.LOOSE, position, after - position))
         elif opcode == rec.CHUNK:
             start = self._window.view(body_at, min(after - body_at, _CHUNK_HEAD, stop - body_at))
             head = rec.parse_chunk_head(start, after - body_at)
@@ -121,7 +121,7 @@ class Scanner:
             kind = SpanKind.CHUNK if after <= stop else SpanKind.CUT_CHUNK
             times = head.start_ns, head.end_ns
             length, size = min(after, stop) - position, head.uncompressed_size
-            catalog.spans.append(Span(kind, position, length, 0, *times, inflated=size))
+            catalog.spans.append(ByteSpan(kind, position, length, 0, *times, inflated=size))
             catalog.compressions.add(head.compression)
             self._last_ns = max(head.end_ns, self._last_ns or 0)
         elif opcode == rec.MESSAGE_INDEX:
@@ -220,7 +220,7 @@ def _possible_places(data: NDArray[np.uint8], high: int, end: int) -> Ints:
 _STEPS_PER_JUMP: Final = 20
 """Minimum number of increments by one per jump; below it, sequence numbers do not count messages."""
 
-Numbered: TypeAlias = tuple[Span, NDArray[np.integer], NDArray[np.uint32], Ints]
+Numbered: TypeAlias = tuple[ByteSpan, NDArray[np.integer], NDArray[np.uint32], Ints]
 """A whole chunk with channels, sequence numbers and log times [ns] of its messages."""
 
 

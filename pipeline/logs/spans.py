@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import map_in_order
 from pipeline.logs import chunks
 from pipeline.logs import records as rec
-from pipeline.logs.chunks import Messages, Span, SpanKind, locate_messages
+from pipeline.logs.chunks import ByteSpan, Messages, SpanKind, locate_messages
 from pipeline.logs.records import Buffer, ByteSource, Loss
 from pipeline.logs.ros1 import load_ros1
 
@@ -41,7 +41,7 @@ class Loaded:
     index_damaged: bool = False
 
 
-def load_span(source: ByteSource, span: Span) -> Loaded:
+def load_span(source: ByteSource, span: ByteSpan) -> Loaded:
     """Read, inflate and check one span: a chunk is whole, or lost."""
     if span.length + span.index_length > _MAX_SPAN:
         return _lost(span, "too_large", f"more than {_MAX_SPAN >> 20} MiB at once are not read")
@@ -59,7 +59,7 @@ def load_span(source: ByteSource, span: Span) -> Loaded:
     return Loaded(blob, messages, _damage_losses(span, messages, len(blob)), unchecked=True)
 
 
-def _load_chunk(span: Span, blob: memoryview) -> Loaded:
+def _load_chunk(span: ByteSpan, blob: memoryview) -> Loaded:
     """Inflate and check a chunk.
 
     Raises:
@@ -85,7 +85,7 @@ def _load_chunk(span: Span, blob: memoryview) -> Loaded:
     )
 
 
-def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer) -> Loaded:
+def _load_start(span: ByteSpan, head: rec.ChunkHead, stored: Buffer) -> Loaded:
     """Read the messages of a chunk that are before the end of the file, where it is cut off."""
     chunks.check_size(head.compressed_size, head.compression, head.uncompressed_size)
     chunk = chunks.inflate_start(stored, head.compression, head.uncompressed_size)
@@ -114,7 +114,7 @@ def _read_entries(blob: Buffer) -> list[Entries] | None:
     return entries or None
 
 
-def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
+def _damage_losses(span: ByteSpan, messages: Messages, size: int) -> list[Loss]:
     """The loss of bytes that hold no record, from the log time before them to that after them."""
     if not messages.damage:
         return []
@@ -137,7 +137,7 @@ def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
     ]
 
 
-def _lost(span: Span, kind: str, reason: str) -> Loaded:
+def _lost(span: ByteSpan, kind: str, reason: str) -> Loaded:
     text = f"{span.kind.value} of {span.length} bytes at {span.offset}: {reason}"
     loss = Loss(kind, text, bytes=span.length, chunks=1, start_ns=span.start_ns, end_ns=span.end_ns)
     return Loaded(b"", locate_messages(b""), [loss])
@@ -151,8 +151,8 @@ _IN_FLIGHT: Final = 1 << 30
 
 def load_spans(
     source: ByteSource,
-    spans: Sequence[Span],
-    use: Callable[[Span, Loaded], Result],
+    spans: Sequence[ByteSpan],
+    use: Callable[[ByteSpan, Loaded], Result],
     *,
     threads: int,
 ) -> Iterator[Result]:
@@ -168,7 +168,7 @@ def load_spans(
         The results of ``use``.
     """
 
-    def read(span: Span) -> Result:
+    def read(span: ByteSpan) -> Result:
         return use(span, load_span(source, span))
 
     yield from map_in_order(

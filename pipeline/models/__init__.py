@@ -112,7 +112,7 @@ else:
                 "Level",
                 "Parameter",
                 "Quantity",
-                "Reading",
+                "Meaning",
                 "Search",
                 "cut_interval",
                 "is_of_one_run",

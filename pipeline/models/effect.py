@@ -20,10 +20,10 @@ from pipeline.models.parameter import (
     Largest,
     Least,  # noqa: F401 - what a file of an effect needs
     Level,
+    Meaning,
     Parameter,
     Part,
     Plausible,  # noqa: F401 - what a file of an effect needs
-    Reading,
     Search,  # noqa: F401 - what a file of an effect needs
     Spread,  # noqa: F401 - what a file of an effect needs
 )
@@ -126,7 +126,7 @@ class Effect(ABC):
     late: Late | None = None
     scale_role: Literal["", "gain", "radius"] = ""
     has_state: bool = False
-    readings: tuple[Reading, ...] = ()
+    readings: tuple[Meaning, ...] = ()
     open_numbers: frozenset[str] = frozenset()
 
     def __init_subclass__(cls) -> None:

@@ -23,7 +23,7 @@ class Level(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Reading:
+class Meaning:
     """Interpretation of a parameter that belongs to a level.
 
     Attributes:

@@ -14,12 +14,12 @@ from msgspec.structs import replace
 
 from pipeline.core import Complex, Floats, SlipError
 from pipeline.estimation import (
+    DiagnosisInput,
     EstimationData,
     Fitted,
     Free,
     Input,
     ModelState,
-    Recording,
     RunResiduals,
     fit_model,
 )
@@ -79,7 +79,7 @@ class Studied:
 
 
 def study(
-    recordings: Sequence[Recording], vehicle: Vehicle, notify: Callable[[str], None] | None = None
+    recordings: Sequence[DiagnosisInput], vehicle: Vehicle, notify: Callable[[str], None] | None = None
 ) -> Studied:
     """Diagnose runs jointly, and fit the effects that the diagnosis identified beyond doubt.
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pipeline.recording.hypotheses import *
     from pipeline.recording.log_columns import *
     from pipeline.recording.lost_messages import *
+    from pipeline.recording.motion import *
     from pipeline.recording.pose_choice import *
     from pipeline.recording.pose_topics import *
     from pipeline.recording.topic_values import *
@@ -40,7 +41,8 @@ else:
             "hypotheses": ("BLOCK_S", "LASTS_NATS", "follow_likeliest", "price_change"),
             "log_columns": ("LogColumns",),
             "lost_messages": ("number_gaps",),
-            "pose_choice": ("ONE_SCALE", "PoseRating", "find_steady_gain", "measure_rest"),
+            "motion": ("ONE_SCALE", "find_one_ratio"),
+            "pose_choice": ("PoseRating", "measure_rest"),
             "pose_topics": ("POSE_FINDINGS", "SLOW_HZ"),
             "topic_values": ("list_wanted",),
         },

@@ -14,8 +14,7 @@ from pipeline.core import Flags, Floats, SlipError, fit_robustly, pick, robust_s
 from pipeline.recording.case import Case
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
-from pipeline.recording.motion import FEWEST_STEPS
-from pipeline.recording.pose_choice import ONE_SCALE
+from pipeline.recording.motion import FEWEST_STEPS, ONE_SCALE
 from pipeline.recording.readings import Held, Reading
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import DriveForm, Vehicle, list_presets
@@ -181,8 +180,9 @@ def find_ratio(asked: Floats, got: Floats) -> float | None:
     spread = robust_spread(ratio - middle)
     # A dead band takes more of a slower step; a scale is that of the fastest ones, too.
     apart = inverse - inverse.mean()
-    (level, slope), rest = fit_robustly(np.column_stack((np.ones(apart.size), apart)), ratio)
-    is_sloped = float(rest.std()) < 0.5 * float(ratio.std())
+    line = fit_robustly(np.column_stack((np.ones(apart.size), apart)), ratio)
+    level, slope = line.gains
+    is_sloped = float(line.rest.std()) < 0.5 * float(ratio.std())
     changed = abs(level - slope * inverse.mean() - middle) if is_sloped else 0.0
     return middle if middle > _LEAST_RATIO and max(spread, changed) < ONE_SCALE * middle else None
 

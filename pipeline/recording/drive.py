@@ -540,3 +540,59 @@ def interpolate_repeats(times: Floats, values: Floats) -> tuple[Floats, float]:
     filled = values.copy()
     filled[known] = np.interp(stamps, stamps[knots], read[knots])
     return filled, period
+
+
+_DIFFERENCE = 0.98
+"""Share of what a pose moves from message to message that speeds times these steps explain from which on the
+speeds are its differences."""
+_SCATTERED = 0.9
+"""The same of speeds between which one interpolates, below which they scatter: stamps jitter, or an encoder
+is read less often than it is sent."""
+_REST_S = 0.3
+"""Time [s] without any change after which a base is at rest, and not between two readings of its encoders."""
+
+
+def smooth_differences(
+    times: Floats, position: Floats, yaw: Floats, speeds: tuple[Floats, Floats]
+) -> tuple[Floats, Floats] | None:
+    """Speeds of an odometry by how far its own positions go, where those that it states scatter about them.
+
+    Args:
+        times: of its messages [s], shape (n,).
+        position: [m], shape (n, 2).
+        yaw: [rad], shape (n,).
+        speeds: ahead [m/s] and turning [rad/s], shape (n,) each.
+
+    Returns:
+        Both speeds over about two of its readings; None where those that are stated serve.
+    """
+    elapsed = np.diff(times)
+    yaw = np.unwrap(yaw)
+    if elapsed.size == 0 or not (np.isfinite(position).all() and (elapsed > 0.0).all()):
+        return None
+    along = np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
+    moved = (np.diff(position[:, 0] + 1j * position[:, 1]) * along).real, np.diff(yaw)
+    shares = []
+    for change, speed in zip(moved, speeds, strict=True):
+        size = float(change @ change)
+        if size == 0.0:
+            continue
+        rests = change - speed[1:] * elapsed, change - 0.5 * (speed[1:] + speed[:-1]) * elapsed
+        shares.append([1.0 - float(rest @ rest) / size for rest in rests])
+    if (
+        not shares
+        or min(one for one, _ in shares) < _DIFFERENCE
+        or min(one for _, one in shares) > _SCATTERED
+    ):
+        return None
+    changed = np.append(True, (moved[0] != 0.0) | (moved[1] != 0.0))
+    last = np.maximum.accumulate(np.where(changed, times, -np.inf))
+    knots = np.flatnonzero(changed | (times - last > _REST_S))
+    half = float(np.median(np.diff(times[knots])))
+    paths = (np.append(0.0, np.cumsum(one))[knots] for one in moved)
+    ahead, turning = (
+        (np.interp(times + half, times[knots], path) - np.interp(times - half, times[knots], path))
+        / (2.0 * half)
+        for path in paths
+    )
+    return ahead, turning

@@ -135,15 +135,23 @@ def snap(scale: float) -> float:
     return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
 
 
+_STEERS = 0.2
+"""Share of a body's turning that its wheels explain at most where it turns by something else."""
+
+
 def _explains_more(case: Case, factors: Mapping[str, float]) -> bool:
     """Whether wheels with these factors explain the motion clearly better than without.
 
-    Circles of one radius are explained by any scale of a side: slip of a side is no scale of its encoder.
+    Circles of one radius are explained by any scale of a side: slip of a side is no scale of its encoder. A
+    body that does not turn by its wheels, as a car, tells by its way alone.
     """
     section = msgspec.structs.replace(case.complete().wheels, factors=dict(factors))
     made = case.wheels.reading.explained
     again = case.read(case.wheels.source, is_measured=True, section=section).explain(case.motion)
-    return again.blocks.size == made.blocks.size and compare(again.blocks, made.blocks) > CLEAR
+    if again.blocks.size != made.blocks.size:
+        return False
+    steers = max(again.shares[1], made.shares[1]) < _STEERS
+    return steers or compare(again.blocks, made.blocks) > CLEAR
 
 
 def ask_joints(case: Case) -> Case:

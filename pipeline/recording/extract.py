@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError
+from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, rigid
 from pipeline.logs import TopicColumns
 from pipeline.recording import pose_topics, topic_values
 from pipeline.recording.clocks import Recorded, TopicClock, align_clocks, find_pauses
@@ -25,6 +25,7 @@ from pipeline.recording.drive import (
     read_rates,
     read_signal,
     read_speed,
+    smooth_differences,
 )
 from pipeline.recording.echo import check_echo
 from pipeline.recording.findings import Finding, StageError, blame_damage
@@ -573,6 +574,8 @@ class Extraction:
         else:
             stamp, log_time, (first, second) = self._read_pair(source, section, vehicle, held=held)
             topic = source.signals[0].topic
+            if source.form is DriveForm.BODY:
+                first, second = self._smooth(topic, stamp, (first, second), held=held)
             nominal = not held and topic_values.is_of_base(source, {topic: self.columns[topic].type_name})
             sideways = self._read_sideways(source, vehicle, held=held)
             drive = read_pair(
@@ -601,6 +604,22 @@ class Extraction:
         return frame.with_columns(
             pl.lit(None, dtype=pl.Float64).alias(name) for name in names if name not in drive
         )
+
+    def _smooth(
+        self, topic: str, stamp: Stamps, speeds: tuple[Floats, Floats], *, held: bool
+    ) -> tuple[Floats, Floats]:
+        """Speeds of an odometry, by its own positions where they are differences of these that scatter."""
+        columns, _, order = self._require(topic, held=held)
+        pose = find_type(columns.type_name).pose
+        if pose is None or pose.names or not (pose.orientation or pose.angle) or order.size != stamp.size:
+            return speeds
+        places = topic_values.read_pose_topic(columns, pose).take(order)
+        yaw = rigid.euler_from_quaternions(places.quaternion)[2]
+        made = smooth_differences(self._seconds(stamp), places.position[:, :2], yaw, speeds)
+        if made is None:
+            return speeds
+        self.findings.append(Finding("speeds_of_positions", "info", topic))
+        return made
 
     def _leave_out(self, frame: pl.DataFrame, spans: Sequence[OutageSection], *, held: bool) -> pl.DataFrame:
         """A drive without the readings that are none: rows of it, values, or commands that are not live."""

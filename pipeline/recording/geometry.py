@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 
 from pipeline.core import NORMAL_95, fit_robustly, join_parts
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Fit, Motion, Steps, fit
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Motion, MotionFit, Steps, fit
 from pipeline.recording.readings import DELAYS_S, SIDES, UNEXPLAINED, Explained, Reading
 from pipeline.sources import RANGES, find_alike_vehicles
 
@@ -54,7 +54,17 @@ def take_clear(value: float, share: float) -> Length | None:
     return length if length.is_clear else None
 
 
-def measure_share_error(one: Fit) -> float:
+_GUESSED = 0.5
+"""Relative standard error of a length that is shown, but by one stretch of the drive alone."""
+
+
+def take_shown(value: float, share: float, made: Explained) -> Length | None:
+    """A length by the turning of a drive, a wide guess if it is not clear; None if nothing turns so."""
+    clear = take_clear(value, share)
+    return clear or (Length(value, _GUESSED * value) if made.sign("turned") else None)
+
+
+def measure_share_error(one: MotionFit) -> float:
     """Relative standard error of a gain."""
     size = abs(float(one.gains[0]))
     spread = one.spread / (NORMAL_95 * size) if size > 0.0 else np.inf
@@ -178,7 +188,7 @@ def explain_followed(reading: Reading, made: Explained) -> Explained:
     for _ in range(3):
         if followed.sum() < FEWEST_STEPS:
             return made
-        gains = np.column_stack([fit_robustly(columns[followed], side[followed])[0] for side in sides.T])
+        gains = np.column_stack([fit_robustly(columns[followed], side[followed]).gains for side in sides.T])
         limited = (np.abs(columns @ gains) > _OVER * top).any(axis=1)
         last = np.maximum.accumulate(np.where(limited, steps.end, -np.inf))
         followed = steps.start > last + _AFTER_S
@@ -215,7 +225,7 @@ def measure_controller(made: Explained) -> tuple[Length | None, Length | None]:
     errors = list_errors(made)
     radius = take_clear(1.0 / ahead, errors[0]) if ahead > 0.0 else None
     track = (
-        take_clear(bent / ahead, float(np.hypot(errors[0], errors[1])))
+        take_shown(bent / ahead, float(np.hypot(errors[0], errors[1])), made)
         if radius is not None and bent > 0.0
         else None
     )
@@ -251,9 +261,9 @@ def measure_car(car: Explained, *, is_measured: bool) -> Geometry:
     ahead, bent = abs(float(car.ahead.gains[0])), abs(float(car.turned.gains[0]))
     of_speed, of_turn = list_errors(car)
     if not car.sign("ahead"):
-        return Geometry(wheelbase=take_clear(1.0 / bent, of_turn))
+        return Geometry(wheelbase=take_shown(1.0 / bent, of_turn, car))
     # A car that is slower than commanded turns by the speed that it has.
-    wheelbase = take_clear(ahead / bent, float(np.hypot(of_speed, of_turn)))
+    wheelbase = take_shown(ahead / bent, float(np.hypot(of_speed, of_turn)), car)
     return Geometry(rolled=take_clear(ahead, of_speed) if is_measured else None, wheelbase=wheelbase)
 
 

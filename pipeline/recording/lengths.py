@@ -16,6 +16,7 @@ from pipeline.recording.geometry import (
     measure_controller,
     measure_geometry,
     take_clear,
+    take_shown,
 )
 from pipeline.sources import DriveForm
 
@@ -47,9 +48,8 @@ def _measure_driven(case: Case) -> Geometry:
         return Geometry()
     radius, width = take_clear(case.wheel_factor() / gains["ahead"], errors["ahead"]), None
     if command.reading.form == "body" and radius is not None:
-        width = take_clear(
-            gains["turned"] / gains["ahead"], float(np.hypot(errors["ahead"], errors["turned"]))
-        )
+        share = float(np.hypot(errors["ahead"], errors["turned"]))
+        width = take_shown(gains["turned"] / gains["ahead"], share, explained)
     if form == "steering":
         return Geometry(rolled=radius, wheelbase=width)
     return Geometry(radius=radius, track=width)

@@ -144,6 +144,9 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> Sequence[TopicColumns]:
 
 _MOST_UNFIT = 5
 """Topics without a needed field that are left out of a log: each costs a reading of the others."""
+_AS_DRAWN = 0.1
+"""Absolute logarithm of the controller's wheel radius over the height of a wheel's frame, up to which it is
+that."""
 _STAND_INS: Mapping[str, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "autoware_auto_control_msgs/", "hunter_msgs/")
 
@@ -550,9 +553,7 @@ def _compare(chosen: Choice, given: Given) -> Choice:
         if best is not None and useless:
             bare = replace(bare, pose=None)
             alone = _let_wheels_stand_in(replace(chosen, sources=bare), replace(given, sources=bare))
-            # Speeds that are differences of late positions say little of the wheels.
-            least = _STEADY if best.same_as else -math.inf
-            if alone.recording is not None and alone.recording.margin > least:
+            if alone.recording is not None and (alone.recording.is_followed or not best.same_as):
                 what = f"the poses of {best.source}: {useless}"
                 unused = Finding("numbers_not_used", "warning", best.source.topic, {"what": what})
                 return replace(alone, findings=(*alone.findings, unused))
@@ -603,8 +604,6 @@ def _do_without_pose(chosen: Choice, given: Given, refused: Finding) -> Choice:
     return replace(noted, findings=(*noted.findings, error))
 
 
-_STEADY = 5.0
-"""Vuong's statistic of an odometry's speeds with the commands from which on they stand in for its poses."""
 _ASTRAY = 0.2
 """Share of a pose's path that the wheels do not explain, from which on it may be that of another body."""
 
@@ -646,7 +645,11 @@ def _fit_vehicle(
     if "kind" not in given and kind != "mecanum" and find_sideways_share(topics, sources.command):
         # The arrangement of the wheels is unknown: only body motion can be evaluated.
         kind = "omni"
-    known = {**read_frames(TransformBuffer(topics))[1], **recorded, **given}
+    known = {
+        **_trust_frames(read_frames(TransformBuffer(topics))[1], recording.geometry),
+        **recorded,
+        **given,
+    }
     lengths = recording.geometry.list_lengths(kind)
     fitted = {key: length.value for key, length in lengths.items()}
     errors = {key: float(length.error) for key, length in lengths.items() if key not in known}
@@ -694,6 +697,17 @@ def _fit_vehicle(
         sources=sources,
         findings=tuple(findings),
     )
+
+
+def _trust_frames(framed: Mapping[str, float], seen: Geometry) -> Mapping[str, object]:
+    """Lengths by the frames of wheels, without a radius that is not the one which the controller counts on.
+
+    The height of a frame is where a wheel is drawn.
+    """
+    drawn = framed.get("wheel_radius_m")
+    if drawn is None or seen.radius is None or abs(math.log(seen.radius.value / drawn)) < _AS_DRAWN:
+        return framed
+    return {key: value for key, value in framed.items() if key != "wheel_radius_m"}
 
 
 def _explain_left_out(

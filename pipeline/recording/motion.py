@@ -19,12 +19,14 @@ from pipeline.core import (
     Floats,
     Ints,
     find_scale,
+    fit_robustly,
     list_likelihoods,
     recur,
     rigid,
+    robust_spread,
     student_quantile,
-    weigh,
 )
+from pipeline.run import LIVE_SHARE
 
 BLOCK_S = 5.0
 """Length of a block [s], longer than any correlation of the noise that is modelled."""
@@ -34,6 +36,9 @@ LEAST_NATS = 0.02
 """Least gain in log-likelihood per step of a decision: below it a difference is of no importance."""
 FEWEST_STEPS = 30
 """Least number of steps for a likelihood."""
+ONE_SCALE = 0.2
+"""Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
+not."""
 DRIVEN_S = 10.0
 """Driving [s] in one of the blocks that the first gain of a fit is compared between: time enough for starts,
 stops and turns, so that what differs is not the manoeuvre alone."""
@@ -46,6 +51,10 @@ _NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta 
 _LEAST_FREEDOM = 0.5
 """Least number of degrees of freedom of a spread: with less, one block has more than five times the weight of
 the other."""
+_LEAST_ERROR = 1e-15
+"""Least standard error, to keep quotients finite."""
+_ROUNDS = 6
+"""Reweightings of a fit."""
 _MOST_ROWS = 3000
 """Number of steps above which the noise is fitted to some of the blocks."""
 
@@ -79,7 +88,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Fit:
+class MotionFit:
     """Regression under correlated noise with heavy tails.
 
     Attributes:
@@ -107,32 +116,15 @@ def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
     return recur(made, np.where(goes_on[:, 0], theta, 0.0))
 
 
-def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:
-    """Gains, residuals and square roots of the weights by reweighted least squares."""
-    gains: Floats = np.zeros(columns.shape[1])
-    weight: Floats = np.ones(values.size)
-    rest: Floats = values
-    for _ in range(rounds):
-        if gains.size:
-            weighted = columns * weight[:, None]
-            normal, right = weighted.T @ weighted, weighted.T @ (values * weight)
-            gains = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0], dtype=np.float64)
-        rest = np.asarray(values - columns @ gains, dtype=np.float64)
-        weight = np.sqrt(weigh(rest))
-        if not gains.size:
-            break
-    return gains, rest, weight
-
-
-def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
-    """Fit a channel of the motion by columns.
+def fit(values: Floats, columns: Floats, steps: Steps) -> MotionFit:
+    """MotionFit a channel of the motion by columns.
 
     Args:
         values: increments, shape (n,).
         columns: explaining increments, shape (n, k); k may be zero.
         steps: the time steps.
     """
-    _, rest, _ = _solve(values, columns)
+    rest = fit_robustly(columns, values, measure=find_scale, rounds=_ROUNDS).rest
     noise, best = _NOISES[0], -np.inf
     # Whole blocks of a long run show its noise.
     some = steps.block % max(1, rest.size // _MOST_ROWS) == 0
@@ -143,17 +135,16 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
             noise, best = each, score
     white = _whiten(np.column_stack([values, columns]), noise, steps)
     design = white[:, 1:]
-    gains, rest, weight = _solve(white[:, 0], design)
+    made = fit_robustly(design, white[:, 0], measure=find_scale, rounds=_ROUNDS)
+    gains, rest = made.gains, made.rest
     blocks: Floats = np.bincount(steps.block, list_likelihoods(rest)).astype(np.float64)
     if not gains.size:
-        return Fit(gains, gains, blocks, blocks)
-    inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))
-    pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
-    error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
+        return MotionFit(gains, gains, blocks, blocks)
+    error = np.maximum(made.find_errors(design, steps.block), _LEAST_ERROR)
     other = list_likelihoods(rest + 2.0 * gains[0] * design[:, 0])
     turned: Floats = np.bincount(steps.block, other).astype(np.float64)
     spread = measure_spread(values - columns[:, 1:] @ gains[1:], columns[:, 0], float(gains[0]), steps)
-    return Fit(gains, gains / error, blocks, turned, spread)
+    return MotionFit(gains, gains / error, blocks, turned, spread)
 
 
 def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) -> float:
@@ -190,6 +181,23 @@ def measure_spread(values: Floats, column: Floats, gain: float, steps: Steps) ->
 def measure_share(values: Floats, model: Floats) -> float:
     """Part of the size of some increments that a model explains, outliers discounted, from 0 to 1."""
     return 1.0 - min(1.0, (find_scale(values - model) / find_scale(values)) ** 2)
+
+
+def find_one_ratio(moved: Floats, driven: Floats, fewest: int) -> float | None:
+    """Median of one speed over another; None if the ratio is not constant.
+
+    Args:
+        moved: shape (n,); NaN where unknown.
+        driven: in the same order, which counts where it is well above that of standing.
+        fewest: least number of samples that count.
+    """
+    size = np.where(np.isfinite(moved), np.nan_to_num(np.abs(driven)), 0.0)
+    live = size > LIVE_SHARE * float(np.max(size, initial=0.0))
+    if live.sum() < fewest:
+        return None
+    ratio = moved[live] / driven[live]
+    middle = float(np.median(ratio))
+    return middle if robust_spread(ratio - middle) <= ONE_SCALE * abs(middle) else None
 
 
 def compare(one: Floats, other: Floats) -> float:

@@ -11,16 +11,13 @@ from pipeline.core import Floats, rigid
 from pipeline.recording.case import Case
 from pipeline.recording.evidence import RATES, SPEEDS
 from pipeline.recording.findings import Finding
-from pipeline.recording.motion import FEWEST_STEPS, measure_share
+from pipeline.recording.motion import FEWEST_STEPS, find_one_ratio
 from pipeline.recording.readings import Held, Reading
-from pipeline.run import LIVE_SHARE
 from pipeline.sources import LENGTH_UNITS, DriveForm, PoseContent
 
 _APART = 4.0
 """Ratio of pose and speeds from which on one of them is wrong: skidding wheels turn a body a quarter as far
 as they say at least."""
-_CONSTANT = 0.9
-"""Least share of the pose's motion that a factor in its computation explains."""
 _ALIKE = 0.1
 """Largest absolute logarithm of two ratios that are the same: of a unit, or of the time step."""
 
@@ -86,12 +83,9 @@ def _find_ratio(times: Floats, changed: Floats, speed: Held) -> float | None:
     """How far a pose changes over how far speeds say it does, if that is a constant; else None."""
     if not speed.moves or times[-1] <= times[0]:
         return None
-    said = np.abs(np.interp(times, speed.times, speed.values)) * np.diff(times, prepend=times[0])
-    live = said > LIVE_SHARE * float(np.quantile(said, 0.95))
-    if live.sum() < FEWEST_STEPS:
-        return None
-    ratio = float(np.median(changed[live] / said[live]))
-    return ratio if ratio > 0.0 and measure_share(changed, ratio * said) > _CONSTANT else None
+    rate = changed / np.diff(times, prepend=times[0] - float(np.median(np.diff(times))))
+    ratio = find_one_ratio(rate, np.abs(np.interp(times, speed.times, speed.values)), FEWEST_STEPS)
+    return ratio or None
 
 
 def _is_near(ratio: float, other: float) -> bool:

@@ -122,9 +122,9 @@ class _Follows:
 
 
 def _fit(columns: Floats, values: Floats, rows: Flags, least: float) -> _Follows:
-    gains, rest = fit_robustly(columns[rows], values[rows])
+    made = fit_robustly(columns[rows], values[rows])
     spanned = _find_spanned(columns[:, : columns.shape[1] // 3], rows)
-    return _Follows(columns @ gains, float(np.hypot(find_scale(rest), least)), spanned)
+    return _Follows(columns @ made.gains, float(np.hypot(find_scale(made.rest), least)), spanned)
 
 
 def _find_spanned(moved: Floats, rows: Flags) -> Flags:
@@ -328,7 +328,7 @@ def _follows_otherwise(
         return False
     # The blocks of each source and those before them, not as many numbers as there are blocks.
     counts = [min(columns.shape[1] // 3 * 2, values.size // 3) for columns in sources]
-    rests = [fit_robustly(one[:, :count], values)[1] for one, count in zip(sources, counts, strict=True)]
+    rests = [fit_robustly(one[:, :count], values).rest for one, count in zip(sources, counts, strict=True)]
     least = min(one.scale for one in fits)
     if outage.reads == "one value":
         stands = float(_rate_repeating(values, fits).sum())

@@ -18,14 +18,14 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, SlipError, arrays, fit_robustly, format_share, rigid
+from pipeline.core import Floats, SlipError, arrays, fit_robustly, format_share, rigid
 from pipeline.recording.drive import read_speed
 from pipeline.recording.extract import Given, extract_tables
 from pipeline.recording.findings import Finding
 from pipeline.recording.pose_topics import SLOW_HZ
 from pipeline.recording.satellite import estimate_noise
 from pipeline.recording.topic_values import FEWEST_MESSAGES
-from pipeline.run import LIVE_SHARE, SPAN_S, STILL_MPS
+from pipeline.run import SPAN_S, STILL_MPS
 from pipeline.sources import (
     DEAD_RECKONED,
     FILTERED,
@@ -36,9 +36,6 @@ from pipeline.sources import (
     is_localization,
 )
 
-ONE_SCALE = 0.2
-"""Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
-not."""
 _FIXED_FRAME: Final = re.compile(
     r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"
 )
@@ -386,7 +383,7 @@ def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None
     size = float(np.sqrt(np.mean(moved**2)))
     if size < STILL_MPS * SPAN_S:
         return None
-    _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
+    rest = fit_robustly(np.column_stack((driven, changed)), moved).rest
     return float(np.median(np.abs(rest))) / size
 
 
@@ -418,31 +415,3 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
     return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated(
         best.same_as, *(one.source.topic for one in ratings[1:] if one.same_as)
     )
-
-
-def find_steady_gain(moved: Floats, driven: Floats) -> float | None:
-    """Weighted median of moved over driven; None if the ratio is not constant."""
-    gain = _median_gain(moved, driven)
-    if gain is None:
-        return None
-    live = _find_live(driven)
-    rest = np.abs(moved[live] / (gain * driven[live]) - 1.0) if gain else np.ones(1)
-    return gain if float(np.median(rest)) < ONE_SCALE else None
-
-
-def _find_live(driven: Floats) -> Flags:
-    """Known spans with a motion well above that of standing, shape (n,)."""
-    size = np.nan_to_num(np.abs(driven))
-    live: Flags = size > LIVE_SHARE * float(np.max(size, initial=0.0))
-    return live
-
-
-def _median_gain(moved: Floats, driven: Floats) -> float | None:
-    """Weighted median of moved over driven; None if hardly anything was driven."""
-    live = _find_live(driven)
-    if live.sum() < FEWEST_MESSAGES:
-        return None
-    ratio, weight = moved[live] / driven[live], np.abs(driven[live])
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    return float(ratio[order][np.searchsorted(total, 0.5 * total[-1])])

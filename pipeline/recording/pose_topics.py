@@ -116,7 +116,7 @@ _FASTEST = 60.0
 
 
 @dataclass(frozen=True)
-class Track:
+class PoseTrack:
     """A series of poses cut into segments.
 
     Attributes:
@@ -167,7 +167,7 @@ def cut_track(
     clock_breaks: Flags,
     settings: VelocitySection,
     topic: str,
-) -> Track:
+) -> PoseTrack:
     """Cut poses into segments at gaps, clock jumps and pose jumps, and flag held poses.
 
     Args:
@@ -188,7 +188,7 @@ def cut_track(
     held = np.zeros(times.size, dtype=bool)
     good = np.flatnonzero(valid)
     if good.size == 0:
-        return Track(position, unit, valid, held, segment, tuple(findings))
+        return PoseTrack(position, unit, valid, held, segment, tuple(findings))
     t, p, q = times[good], position[good], unit[good]
     # A break before a pose that was left out moves to the next remaining one.
     counted = np.cumsum(clock_breaks)[good]
@@ -205,7 +205,7 @@ def cut_track(
     jumps = _find_pose_jumps(t, p, q, held[good], gaps | clock, settings)
     segment[good] = rigid.number_segments(gaps | clock | jumps)
     findings += _report_stamps(t, gaps, jumps, held[good], topic)
-    return Track(position, unit, valid, held, segment, tuple(findings))
+    return PoseTrack(position, unit, valid, held, segment, tuple(findings))
 
 
 def _find_pose_jumps(

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.core import Floats, Ints, spread_equal
 from pipeline.recording import topic_values
 from pipeline.recording.findings import Finding
-from pipeline.run import LIVE_SHARE
+from pipeline.recording.motion import find_one_ratio
 from pipeline.sources import list_factors
 
 _NEIGHBOURS: Final = 2
@@ -25,7 +25,7 @@ _PERIODS: Final = tuple(2.0**bits for bits in range(8, 33))
 """Numbers of ticks after which counters begin again."""
 
 _NEAR: Final = 0.1
-"""Relative deviation of a ratio that is not constant, or not one: both may be filtered."""
+"""Relative deviation of a ratio that is not one: both may be filtered."""
 _EXACT: Final = 0.03
 """Relative tolerance of a ratio around that of a unit, which a gear of 60 to 1 misses."""
 _STILL_RADPS: Final = 0.05
@@ -154,7 +154,9 @@ def settle_joints(topic: str, velocity: Mapping[str, Floats], turned: Mapping[st
         velocity: as recorded, by joint.
         turned: rates of their positions [rad/s], by the same names.
     """
-    ratios = {joint: _find_ratio(velocity[joint], turned[joint]) for joint in velocity}
+    live = {joint: np.where(np.abs(rate) > _STILL_RADPS, rate, np.nan) for joint, rate in turned.items()}
+    fewest = topic_values.FEWEST_MESSAGES
+    ratios = {joint: find_one_ratio(velocity[joint], live[joint], fewest) for joint in velocity}
     gains = {joint: ratio for joint, ratio in ratios.items() if ratio is not None}
     none = tuple(joint for joint, gain in gains.items() if abs(gain) < _NO_VELOCITY)
     findings = []
@@ -191,18 +193,3 @@ def _choose_side(
 
 def _all_near(values: Collection[float], wanted: float) -> bool:
     return all(abs(value / wanted - 1.0) < (_NEAR if wanted == 1.0 else _EXACT) for value in values)
-
-
-def _find_ratio(velocity: Floats, turned: Floats) -> float | None:
-    """Ratio of a velocity to the rate of its position; None where the wheel rests or it is not constant."""
-    live = np.isfinite(turned) & np.isfinite(velocity)
-    live &= np.abs(turned) > LIVE_SHARE * float(
-        np.max(np.abs(turned[live]), initial=_STILL_RADPS / LIVE_SHARE)
-    )
-    if live.sum() < topic_values.FEWEST_MESSAGES:
-        return None
-    ratio = velocity[live] / turned[live]
-    gain = float(np.median(ratio))
-    if not np.any(velocity[live]):
-        return 0.0
-    return None if float(np.median(np.abs(ratio - gain))) > _NEAR * abs(gain) else gain

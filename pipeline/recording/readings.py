@@ -18,8 +18,8 @@ from pipeline.recording.motion import (
     FEWEST_STEPS,
     LEAST_NATS,
     NO_MOTION,
-    Fit,
     Motion,
+    MotionFit,
     Steps,
     compare,
     fit,
@@ -193,13 +193,13 @@ class Explained:
     crossed: bool
     lag: float
     delay: float
-    ahead: Fit
-    turned: Fit
+    ahead: MotionFit
+    turned: MotionFit
     none: tuple[Floats, Floats]
     other: Floats | None
     shares: tuple[float, float] = (0.0, 0.0)
-    aside: tuple[Fit, Floats] | None = None
-    across: tuple[Fit, Floats] | None = None
+    aside: tuple[MotionFit, Floats] | None = None
+    across: tuple[MotionFit, Floats] | None = None
 
     @property
     def is_known(self) -> bool:
@@ -252,7 +252,7 @@ class Explained:
         return int(np.sign(one.gains[0]))
 
 
-_NO_FIT = Fit(np.zeros(1), np.zeros(1), np.zeros(0), np.zeros(0))
+_NO_FIT = MotionFit(np.zeros(1), np.zeros(1), np.zeros(0), np.zeros(0))
 UNEXPLAINED = Explained(
     NO_MOTION,
     crossed=False,
@@ -335,7 +335,7 @@ class Reading:
         return replace(self, explained=self.explain(whole))
 
     def explain(self, whole: Motion) -> Explained:
-        """Fit the motion; `UNEXPLAINED` where too little is recorded."""
+        """MotionFit the motion; `UNEXPLAINED` where too little is recorded."""
         if not (whole.is_known and self.inputs):
             return UNEXPLAINED
         keep = np.logical_and.reduce([one.is_there(whole.steps) for one in self.inputs])
@@ -370,7 +370,7 @@ class Reading:
         return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
 
     def fit_to(self, motion: Motion, delays: Floats, *, crossed: bool) -> Explained:
-        """Fit all of a motion.
+        """MotionFit all of a motion.
 
         Args:
             motion: where the reading is recorded.
@@ -476,8 +476,8 @@ def stack(values: Complex) -> Floats:
     return np.concatenate((values.real, values.imag))
 
 
-def fit_across(motion: Motion, columns: Sequence[Complex], *, lever: bool) -> Fit:
-    """Fit the motion in the plane, both directions alike.
+def fit_across(motion: Motion, columns: Sequence[Complex], *, lever: bool) -> MotionFit:
+    """MotionFit the motion in the plane, both directions alike.
 
     Args:
         motion: of the body.

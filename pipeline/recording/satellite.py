@@ -12,11 +12,11 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import Flags, Floats, Ints, arrays, rigid
+from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, rigid, robust_spread
 from pipeline.recording import topic_values
 from pipeline.recording.findings import Finding
 from pipeline.recording.topic_values import FEWEST_MESSAGES, Located, PoseArrays, Receiver
-from pipeline.run import MOVING_MPS, STILL_MPS, fit_turning
+from pipeline.run import MOVING_MPS, STILL_MPS
 from pipeline.sources import find_type
 
 # Heading of a vehicle from its course over ground, and possibly from a sensor that turns with it.
@@ -239,7 +239,8 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
     turned = rigid.wrap_angle(angle[first + steps] - angle[first])
     size = float(np.sqrt(np.mean(turned**2)))
     moved = np.diff(np.interp(np.stack((start, end)), turning.times, turning.angle), axis=0)[0]
-    scale, bias, rest = fit_turning(moved, end - start, turned)
+    made = fit_robustly(np.column_stack((moved, end - start)), turned, measure=robust_spread)
+    (scale, bias), rest = made.gains.tolist(), made.scale
     if abs(abs(scale) - 1.0) < _GYRO_SCALE:
         # The course also contains the skid: its estimate of a gyro's scale is no better than the nominal one.
         scale = float(np.copysign(1.0, scale))

@@ -269,8 +269,8 @@ def ask_mounting(case: Case) -> Case:
             "pose": str(pose),
         }
         case.findings.append(Finding("pose_angle", "info", "pose", turned))
-    is_known = abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and _is_apart(columns, 1)
-    if is_known and known[0].form != "steering":
+    is_clear = abs(of_lever) > CLEAR and abs(lever) > _LEAST_M and _is_apart(columns, 1)
+    if is_clear and known[0].form != "steering":
         apart = {"value": lever, "half_m": 1.96 * abs(lever / of_lever), "pose": str(pose)}
         case.findings.append(Finding("pose_lever", "info", "pose", apart))
     return case

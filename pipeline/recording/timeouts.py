@@ -236,14 +236,14 @@ def find_hold(reading: Reading, motion: Motion) -> CommandTimeout | None:
 
 def _compare(design: Floats, times: Floats, step: float) -> tuple[float, float]:
     """The 95 % interval of the first coefficient of times that are known to a step."""
-    (first, *others), rest = fit_robustly(design, times)
+    made = fit_robustly(design, times)
     # A fit to n points passes through as many of them as it has coefficients: these show no spread.
-    shown = np.sort(np.abs(rest))[1 + len(others) :]
+    shown = np.sort(np.abs(made.rest))[made.gains.size :]
     clipped = np.minimum(shown, _FAR * robust_spread(shown))
     spread = max(math.sqrt(float(np.mean(clipped**2))), step / math.sqrt(12.0))
     share = math.sqrt(float(np.linalg.pinv(design.T @ design)[0, 0]))
     half = student_quantile(CONFIDENCE, float(shown.size)) * spread * share
-    return first - half, first + half
+    return float(made.gains[0]) - half, float(made.gains[0]) + half
 
 
 class _Run:

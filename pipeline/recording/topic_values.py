@@ -208,7 +208,8 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
         axes = (*axis_fields(pose.position, "xyz"), *_turn_fields(pose))
         named = (*axes, pose.parent, pose.child, pose.names)
         return [*(Signal(source.topic, name) for name in named if name), *source.headings]
-    fields = [Signal(source.topic, _frame_field(types[source.topic])), *source.headings]
+    frame = _frame_field(types[source.topic])
+    fields = [*([Signal(source.topic, frame)] if frame else []), *source.headings]
     if kind.fix is not None:
         names = (kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status)
         fields += [Signal(source.topic, name) for name in names if name]
@@ -546,14 +547,13 @@ def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
     fix = find_type(columns.type_name).fix
     if fix is None:
         raise _holds_no("fix", columns, "pose")
-    latitude, longitude, altitude = (
-        numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude)
-    )
-    status = numbers(columns, fix.status) if fix.status else np.zeros(latitude.size)
+    latitude, longitude = (fix.degrees * numbers(columns, name) for name in (fix.latitude, fix.longitude))
+    altitude = fix.metres * numbers(columns, fix.altitude)
+    status = numbers(columns, fix.status) if fix.status else np.full(latitude.size, fix.least)
     # A receiver without a fix may report zero and zero, in the Gulf of Guinea.
     there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)
     there &= (latitude != 0.0) | (longitude != 0.0)
-    return latitude, longitude, altitude, there & (status >= 0.0)
+    return latitude, longitude, altitude, there & (status >= fix.least)
 
 
 def read_ground_velocity(columns: TopicColumns) -> Floats:
@@ -574,11 +574,12 @@ def read_attitude(columns: TopicColumns) -> Floats | None:
 
 def frame_of(columns: TopicColumns) -> str:
     """Frame in the headers of a topic; empty if there is none."""
-    return first_text(columns, _frame_field(columns.type_name))
+    name = _frame_field(columns.type_name)
+    return first_text(columns, name) if name else ""
 
 
 def _frame_field(kind: str) -> str:
-    """Field with the frame of a fix, a velocity or an IMU."""
+    """Field with the frame of a fix, a velocity or an IMU; empty of a type without one."""
     fix = find_type(kind).fix
     return _FRAME if fix is None else fix.frame
 

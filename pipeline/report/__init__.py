@@ -104,8 +104,8 @@ def set_squares(text: str) -> str:
 
 
 def set_numbers(text: str) -> str:
-    """Numbers of a table's cell as a page sets them: with a minus, or a dash where unknown."""
-    return MISSING if text == NOTHING else _MINUS.sub("\u2212", text)
+    """Numbers of a text as a page sets them: with a minus, an arrow, or a dash where unknown."""
+    return MISSING if text == NOTHING else _MINUS.sub("\u2212", text).replace(" -> ", " \u2192 ")
 
 
 def bracket_unit(unit: str) -> str:
@@ -217,7 +217,6 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "bracket_unit": bracket_unit,
         "capital": begin_large,
         "squares": set_squares,
         "split_literals": _LITERAL.split,
@@ -328,15 +327,34 @@ def render_catalogue(store: Store) -> str:
 
 
 def list_noted(store: Store) -> list[dict[str, str]]:
-    """What became of each log, by path: ``path state reason hint``; without those since removed."""
-    noted = []
-    for note in store.notes(LOG_NOTES).read_all():
-        path = str(mapping_in(note, "log").get("path", ""))
-        if note.get("state") in _WITHOUT_RUN and not ("://" in path or Path(path).exists()):
-            continue
+    """What became of each log, by path: ``path state reason hint``; without those since removed or moved.
+
+    Of several logs of one run the first that is there counts, and the others are copies of it; where none is
+    there any more, the first is gone.
+    """
+    noted: list[dict[str, str]] = []
+    gone: list[tuple[str, str]] = []
+    holders: set[str] = set()
+    notes = {str(mapping_in(note, "log").get("path", "")): note for note in store.notes(LOG_NOTES).read_all()}
+    for path, note in sorted(notes.items()):
         texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
+        run, has_run = str(note.get("run") or ""), texts["state"] not in _WITHOUT_RUN
+        if not ("://" in path or Path(path).exists()):
+            gone += [(path, run)] if has_run else []
+            continue
+        if has_run and run in holders:
+            texts = {"state": "copy", "reason": run, "hint": ""}
+        elif has_run:
+            holders.add(run)
         noted.append({"path": path} | texts)
+    for path, run in gone:
+        if run not in holders:
+            holders.add(run)
+            noted.append({"path": path, "state": "gone", "reason": _GONE, "hint": ""})
     return sorted(noted, key=lambda one: one["path"])
+
+
+_GONE = "the log is not there any more; its results are kept"
 
 
 def count_logs(store: Store) -> dict[str, int]:

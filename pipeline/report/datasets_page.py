@@ -34,8 +34,8 @@ from pipeline.store import Store
 from pipeline.words import (
     Table,
     list_check_sentences,
-    list_compared,
     list_shown_notes,
+    list_sides,
     name_series,
     tabulate_answer,
     tabulate_causes,
@@ -367,7 +367,11 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
         .mark("point", size=170, filled=True, opacity=1)
         .encode(
             **axes,
-            color=encode_column("value:Q", scale={"range": list(theme.SLIP_RAMP)}, legend={"title": about}),
+            color=encode_column(
+                "value:Q",
+                scale={"range": list(theme.SLIP_RAMP), "interpolate": "rgb"},
+                legend={"title": about},
+            ),
             tooltip=["dataset:N", "runs:Q", "energy:Q", "value:Q"],
         )
     )
@@ -426,17 +430,13 @@ def _position_names(drawn: DeploymentMap, ends: tuple[float, float]) -> pl.DataF
 
 def render_check(check: RunsCheck) -> str:
     """The page of `slip check`."""
-    sides = check.sides
-    both = [
-        f"{format_count(len(runs), 'run')} {side}"
-        for side, runs in (("before", sides.before), ("after", sides.after))
-    ]
-    limits = tabulate_limits(check)
+    sides, limits = list_sides(check), tabulate_limits(check)
     return _build_page(
         "What changed between two drives",
-        both,
+        [f"{format_count(len(sides.get(side, ())), 'run')} {side}" for side in ("before", "after")],
         lines=list_check_sentences(check),
         answer=limits if limits.rows else None,
         tables=[tabulate_check(check)],
-        notes=[*sides.notes, *(f"{label} {text}" for label, text in list_compared(check))],
+        notes=check.sides.notes,
+        runs=[f"{run} ({label})" for label, runs in sides.items() for run in runs],
     ).render()

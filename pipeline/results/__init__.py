@@ -66,7 +66,7 @@ else:
                 "RunDiagnosis",
                 "Share",
                 "SlipBudget",
-                "Span",
+                "Stretch",
                 "Step",
                 "Undecided",
                 "Unexplained",

@@ -193,7 +193,7 @@ class Region(msgspec.Struct, frozen=True):
     expected: float = math.nan
 
 
-class Span(msgspec.Struct, frozen=True):
+class Stretch(msgspec.Struct, frozen=True):
     """A stretch of time [s] with its share of a squared error."""
 
     t_start: float
@@ -213,7 +213,7 @@ class Moments(msgspec.Struct, frozen=True):
 
     quantity: str
     time_share: float
-    spans: tuple[Span, ...]
+    spans: tuple[Stretch, ...]
     run: int = 0
 
 

@@ -8,7 +8,6 @@ from pipeline.run.heading import (
     align_heading,
     choose_heading,
     find_silences,
-    fit_turning,
     has_excluded,
     lay_grid,
     mark_excluded,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import PERIODS, ROUNDING_S, SILENT_S, Flags, Floats, Ints, compiled, robust_spread
+from pipeline.core import PERIODS, ROUNDING_S, SILENT_S, Flags, Floats, Ints, compiled
 from pipeline.run.motion_run import GyroFit, MotionRun, Track
 from pipeline.run.signals import SPAN_S, STILL, Commands, DriveSeries, Signal, Wheels
 
@@ -338,25 +338,6 @@ def has_excluded(excluded: Floats, start: Floats, end: Floats) -> Flags:
 def mark_excluded(excluded: Floats, times: Floats) -> Flags:
     """Whether an excluded sample is next to each time."""
     return has_excluded(excluded, times - 0.05, times + 0.05)
-
-
-def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, float, float]:
-    """Scale, bias [rad/s] and robust spread [rad] of turned = scale * gyro + bias * span.
-
-    Args:
-        gyro: angle measured by a sensor in every window [rad], shape (n,).
-        span: length of every window [s], shape (n,).
-        turned: angle turned by the vehicle [rad], shape (n,).
-    """
-    keep = np.ones(gyro.size, dtype=bool)
-    scale = bias = spread = 0.0
-    for _ in range(4):
-        design = np.column_stack((gyro[keep], span[keep]))
-        (scale, bias), *_ = np.linalg.lstsq(design, turned[keep], rcond=None)
-        rest = np.abs(turned - scale * gyro - bias * span)
-        spread = robust_spread(rest)
-        keep = rest <= max(3.0 * spread, 1e-9)
-    return float(scale), float(bias), spread
 
 
 def _find_pieces(segment: Ints, span: Ints) -> list[tuple[int, int]]:

@@ -26,6 +26,9 @@ class MotionError(SlipError):
 # Only this module converts stored tables to a run. The errors of a recording have been corrected before;
 # nothing is corrected here.
 
+_REPEATED_SHARE = 0.2
+"""Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
+recordings have none, or 0.49 to 0.80."""
 _FAR_S = 2.5
 """Distance from every message [s] beyond which nothing is scored: longer than a prediction (2 s)."""
 _DEAD = 1e-9
@@ -305,7 +308,7 @@ def load_run(
         excluded=excluded,
         duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
-        repeats_s=rigid.measure_repeats(tables["poses"]),
+        repeats_s=_measure_repeats(tables["poses"]),
         is_on_course=_has_finding(tables.get("findings"), "heading_from_course"),
         is_drive_alone=_has_finding(tables.get("findings"), GROUND_UNOBSERVABLE),
     )
@@ -395,8 +398,32 @@ def select_fresh(piece: Mapping[str, NDArray[Any]], wheels: DriveSeries | None) 
     fresh = rigid.select_fresh_poses(times := piece["t"], held := piece["held"])
     if wheels is not None:
         turned = np.append(0, np.cumsum(find_fastest_wheel(wheels) > _ROLLS))
-        fresh = fresh[~rigid.find_waits(times, held, wheels.times, turned)[fresh]]
+        fresh = fresh[~_find_waits(times, held, wheels.times, turned)[fresh]]
     return fresh
+
+
+def _find_waits(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
+    """Short repeats of a pose while wheels turn: a localization that waits.
+
+    Args:
+        times: stamps of a segment's poses [s], shape (n,).
+        held: whether each pose repeats the previous one, shape (n,).
+        wheel_times: stamps of measured wheels [s], shape (m,).
+        turned: number of samples with turning wheels before each stamp, and in total, shape (m + 1,).
+    """
+    waits = np.zeros(times.size, dtype=bool)
+    first, end = np.array(rigid.find_runs(held), dtype=np.int64).reshape(-1, 2).T
+    low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
+    mostly = 2 * (turned[high] - turned[low]) > high - low
+    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= rigid.LONGEST_WAIT_S), end - first)
+    return waits
+
+
+def _measure_repeats(poses: pl.DataFrame) -> float:
+    """Period of the stamps of table `poses` [s] if many of them repeat the pose before; else zero."""
+    held = poses["held"].mean()
+    repeated = isinstance(held, float) and held > _REPEATED_SHARE
+    return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
 
 
 def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:

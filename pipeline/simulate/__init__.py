@@ -202,7 +202,7 @@ def simulate_case(
         name: a case of `list_cases`; None for a plain vehicle without any effect.
         effects: added to the case's own, or in place of them where the id is the same. An empty mapping means
             the effect's usual size.
-        out: file to write, or a folder, which gets ``<case>.mcap``.
+        out: file to write.
         play: a recording of commands that are driven in place of a program, for as long as they last.
         changes: see `Changes`.
 
@@ -216,16 +216,13 @@ def simulate_case(
     scenario = make_scenario(name, effects, **changes)
     if play is not None:
         scenario = _play(scenario, play)
-    target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_log(simulate_run(scenario), target)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_log(simulate_run(scenario), out)
     except OSError as problem:
         what = f"the log cannot be written ({problem.strerror})"
-        raise SimulateError(
-            "cannot_write", what, where=str(target), hint="Choose another --file"
-        ) from problem
-    return target
+        raise SimulateError("cannot_write", what, where=str(out), hint="Choose another --file") from problem
+    return out
 
 
 def _play(scenario: Scenario, path: Path) -> Scenario:

@@ -11,20 +11,15 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, robust_spread
-from pipeline.recording import ONE_SCALE, SIGNALS, Finding, check_echo, find_steady_gain, interpolate_readings
+from pipeline.core import NORMAL_95, Flags, Floats, arrays
+from pipeline.recording import ONE_SCALE, SIGNALS, Finding, check_echo, find_one_ratio, interpolate_readings
 from pipeline.run import (
     ANSWERS_S,
-    SPAN_S,
     Alignment,
-    DriveSeries,
     GyroFit,
     MotionError,
-    Track,
     align_heading,
-    has_excluded,
     mark_excluded,
-    name_inputs,
     read_gyro,
     read_track,
     read_wheels,
@@ -34,10 +29,14 @@ from pipeline.sources import Vehicle, VelocitySection
 from pipeline.stages.drive_numbers import mark_late_starts
 from pipeline.stages.gyro import fit_gyro
 from pipeline.stages.inputs import interpolate_wheels, usual_hold
+from pipeline.stages.outliers import find_outliers
+from pipeline.stages.spans import Span, mark_spans
 from pipeline.stages.timing import estimate_latency
-from pipeline.stages.trust import LEAST_CORRELATION, estimate_delay
+from pipeline.stages.trust import estimate_delay
 from pipeline.stages.velocity import smooth_gyro
 
+_FEWEST_ASKED = 20
+"""Least number of stretches of a command for the controller's multiplier."""
 _LEAST_S = 0.05
 """Least delay of encoders [s] that is corrected here; fits find shorter ones (six of twelve recordings)."""
 
@@ -141,9 +140,7 @@ def measure_wheel_delay(
     seen = smooth_gyro(times, imu, gyro, VelocitySection().window_s)
     known = np.isfinite(turning) & np.isfinite(seen)
     delay = estimate_delay(times[known], turning[known], times[known], seen[known])
-    if delay is None or abs(delay.correlation) < LEAST_CORRELATION or delay.seconds < _LEAST_S:
-        return 0.0
-    return delay.seconds
+    return 0.0 if delay is None or delay.seconds < _LEAST_S else delay.seconds
 
 
 def _report(alignment: Alignment) -> list[Finding]:
@@ -193,7 +190,8 @@ def measure_body_multiplier(commands: pl.DataFrame, vehicle: Vehicle) -> float |
 
     def compare(name: str, wheels: Floats) -> float | None:
         asked = live[name].to_numpy()
-        return find_steady_gain(np.bincount(number, wheels) / count, np.bincount(number, asked) / count)
+        sums = np.bincount(number, wheels), np.bincount(number, asked)
+        return find_one_ratio(sums[0] / count, sums[1] / count, _FEWEST_ASKED)
 
     ahead, turned = compare("body_x", rolled[0]), compare("body_w", rolled[2])
     is_other = ahead is not None and abs(ahead - 1.0) > ONE_SCALE
@@ -226,146 +224,6 @@ def correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: Alignment)
     )
 
 
-# Faults of the localization: half seconds of motion that contradict the vehicle's wheels.
-#
-# A localization that was lost jumps back, stops and catches up, or reports a path that is rotated against the
-# heading. Every displacement over half a second, its direction and its length, is compared with a robust
-# model of the whole run: a regression on the wheels with delays and gains, general enough to contain every
-# effect of the catalogue. A deviation of eight times the usual one at that speed, and of a quarter of a
-# metre, is an outlier, up to a twentieth of the run.
-
-_LONGEST_S = 1.2
-"""Longest span of a tested displacement [s]: over a longer one the wheels' motion is too uncertain."""
-_FEWEST = 200
-"""Least number of displacements for a fit of some thirty parameters: six per parameter."""
-_FAR = 8.0
-"""Usual misfits at a speed above which a displacement is a fault; half and double change no finding of two
-recordings, where `_LEAST_M` decides."""
-_LEAST_M = 0.25
-"""Least misfit of a fault [m]. With half of it the recording on grass of 2024-07-29 has outliers, and 0.6 %
-less median slip."""
-_LARGEST_SHARE = 0.05
-"""Largest fraction of a run that is an outlier; a larger one is a property of the localization. Bad poses are
-0 to 10 % of the windows of the recordings."""
-_LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
-"""Delays [s] at which wheels enter the model: their mixture approximates any lag and inertia up to 1.6 s."""
-_ROUNDS = 10
-"""Reweighting iterations, as in `fit_robustly`."""
-_BINS = 6
-"""Classes of speed of equal size, at least 33 displacements in each."""
-_BESIDE_S = 0.05
-"""Time before and after a displacement that is at fault with it [s]: the step of the grid."""
-
-
-def find_outliers(
-    track: Track, heading: Floats, at: Floats, wheels: DriveSeries, vehicle: Vehicle, excluded: Floats
-) -> list[tuple[float, float]]:
-    """Starts and ends of spans in which the localization is at fault [s], in order.
-
-    Args:
-        track: the poses, shape (n,).
-        heading: of the gyro if there is a good one, else of the poses [rad], shape (n,).
-        at: times of the poses on the clock of the wheels [s], shape (n,).
-        wheels: measured; without them the vehicle's motion is unknown.
-        vehicle: geometry.
-        excluded: times [s] that are not compared, increasing.
-    """
-    first, last = _pair_up(track, excluded)
-    if first.size < _FEWEST:
-        return []
-    off = _measure_misfit(track, heading, at, wheels, vehicle, first, last)
-    begin, end = track.times[first] - _BESIDE_S, track.times[last] + _BESIDE_S
-    live = np.diff(track.times)[track.active[1:]]
-    most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
-    faulty = off > 1.0
-    spans = _join(begin[faulty], end[faulty])
-    # More than a twentieth is not an exception: then only the worst part counts as a fault.
-    while np.diff(spans).sum() > most:
-        faulty &= off > np.quantile(off[faulty], 0.1)
-        spans = _join(begin[faulty], end[faulty])
-    return [(start, stop) for start, stop in spans.tolist()]
-
-
-def _join(begin: Floats, end: Floats) -> Floats:
-    """Union of some intervals in the order of their starts, shape (k, 2)."""
-    until = np.maximum.accumulate(end)
-    first = np.append(True, begin[1:] > until[:-1])[: begin.size]
-    return np.column_stack((begin[first], until[np.append(first[1:], True)[: begin.size]]))
-
-
-def _pair_up(track: Track, excluded: Floats) -> tuple[Ints, Ints]:
-    """Poses of one segment half a second apart, and those before and after a longer wait."""
-    times = track.times
-    first = np.arange(times.size)
-    last = np.searchsorted(times, times + SPAN_S - 1e-3)
-    mask = last < times.size
-    first, last = first[mask], last[mask].astype(np.int64)
-    mask = (track.segment[first] == track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
-    mask &= track.active[first] & track.active[last] & ~has_excluded(excluded, times[first], times[last])
-    return first[mask], last[mask]
-
-
-def _measure_misfit(
-    track: Track, heading: Floats, at: Floats, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints
-) -> Floats:
-    """Distance of each displacement from the robust model, one at the threshold of a fault, shape (n,)."""
-    moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
-    span = track.times[last] - track.times[first]
-    forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
-
-    def drive(rate: Floats, late: float) -> Floats:
-        driven = arrays.integrate_rate(wheels.times, rate)
-        until = np.interp(at - late, wheels.times, driven)
-        return until[last] - until[first]
-
-    own = (heading[last] - heading[first]) / span
-    along = [drive(forward, late) for late in _LAGS_S]
-    across = [drive(forward * turning, late) for late in _LAGS_S]
-    beside = [own * column for column in along]
-    rest = [span, drive(forward * np.abs(turning), 0.1), drive(forward * np.abs(forward), 0.1)]
-    rest += [drive(np.abs(forward), 0.1), drive(np.abs(turning), 0.1), drive(turning, 0.1), own * span]
-    speed = np.abs(along[_LAGS_S.index(0.1)])
-    if wheels.sideways is not None:
-        aside = [drive(sideways, late) for late in _LAGS_S]
-        rest += [*aside, *(own * column for column in aside), drive(sideways * np.abs(sideways), 0.1)]
-        rest += [drive(sideways * turning, 0.1), drive(np.abs(sideways), 0.1)]
-        speed = np.hypot(speed, aside[_LAGS_S.index(0.1)])
-    columns = np.column_stack((*along, *across, *beside, *rest))
-    gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
-    size = np.hypot(gap[:, 0], gap[:, 1])
-    usual = _spread_by_speed(size, speed / span)
-    return size / np.maximum(_FAR * usual, _LEAST_M)
-
-
-def _fit_robustly(columns: Floats, values: Floats) -> Floats:
-    """Residuals of a regression with Cauchy weights, shape (n,)."""
-    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-9
-    design = columns / scale
-    weight, residual = np.ones(values.size), values
-    ridge = 1e-4 * values.size * np.eye(design.shape[1])
-    for _ in range(_ROUNDS):
-        rows = design * weight[:, None]
-        estimates = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
-        residual = values - design @ estimates
-        spread = max(robust_spread(residual), 1e-3)
-        weight = 1.0 / (1.0 + (residual / (2.0 * spread)) ** 2)
-    return residual
-
-
-def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
-    """Usual misfit at each speed: it increases with the speed, since stamps are the source of error."""
-    edges = np.quantile(speed, np.linspace(0.0, 1.0, _BINS + 1))
-    bins = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, _BINS - 1)
-    middle = np.array([np.median(speed[bins == k]) if (bins == k).any() else np.nan for k in range(_BINS)])
-    usual = np.array([np.median(size[bins == k]) if (bins == k).any() else np.nan for k in range(_BINS)])
-    known = np.isfinite(middle)
-    # The median of the length of two normal parts is 1.18 times the spread of either.
-    return np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18
-
-
-# Correction of the poses: their latency against the gyro, and the outliers among them.
-
-
 def align_poses(
     tables: Mapping[str, pl.DataFrame],
     vehicle: Vehicle,
@@ -388,16 +246,16 @@ def align_poses(
     poses = tables["poses"]
     times = poses["t"].to_numpy()
     gyro, wheels = read_gyro(tables.get("imu")), read_wheels(tables.get("wheels"), vehicle)
-    excluded, own, outliers = times[~is_live], np.zeros(times.size), list[tuple[float, float]]()
+    excluded, own, outliers = times[~is_live], np.zeros(times.size), list[Span]()
     try:
         stamped = read_track(poses, wheels, name=where)
     except MotionError:
         # A log without enough data for a model still has slip.
-        return _correct_poses(poses, own, own > 0.0), alignment
+        return _correct_poses(poses, own, 0.0, outliers), alignment
     if not is_localization:
         # Integrated wheels have no clock of their own.
         fit = fit_gyro(stamped, gyro, excluded)
-        return _correct_poses(poses, own, own > 0.0), replace(alignment, gyro=_put_on_clock(fit))
+        return _correct_poses(poses, own, 0.0, outliers), replace(alignment, gyro=_put_on_clock(fit))
     ages, spread = estimate_latency(stamped, gyro, excluded)
     for segment in np.unique(stamped.segment).tolist():
         rows, known = poses["segment"].to_numpy() == segment, stamped.segment == segment
@@ -411,30 +269,23 @@ def align_poses(
             heading = seen + align_heading(track, heading - seen, ~mark_excluded(excluded, track.times))
         outliers = find_outliers(track, heading, track.times - late, wheels, vehicle, excluded)
     if outliers:
-        at_fault = track.times[_mark(track.times, outliers)]
+        at_fault = track.times[mark_spans(track.times, outliers)]
         fit = fit_gyro(track, gyro, np.union1d(excluded, at_fault))
     late, moved = _split_delay(fit, gyro)
-    aligned = replace(
+    corrected = replace(
         alignment,
         gyro=_put_on_clock(fit, moved),
         heading_delay_s=late,
         latency_spread_s=spread,
-        outlier_s=sum(end - begin for begin, end in outliers),
+        outlier_s=sum(one.end - one.start for one in outliers),
     )
-    outlier = _mark(times - own, outliers)
-    return _correct_poses(poses, own + late, outlier), aligned
+    return _correct_poses(poses, own, late, outliers), corrected
 
 
-def _mark(times: Floats, spans: Sequence[tuple[float, float]]) -> Flags:
-    """Times in some spans, shape (n,)."""
-    inside = np.zeros(times.size, dtype=bool)
-    for begin, end in spans:
-        inside |= (times >= begin) & (times <= end)
-    return inside
-
-
-def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
-    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
+def _correct_poses(poses: pl.DataFrame, own: Floats, late: float, outliers: Sequence[Span]) -> pl.DataFrame:
+    """Table `poses` with latencies, of each pose its own one besides that of all [s], and outliers."""
+    wrong = mark_spans(poses["t"].to_numpy() - own, outliers)
+    return poses.with_columns(pl.Series("latency", own + late), pl.Series("outlier", wrong))
 
 
 def _split_delay(fit: GyroFit | None, gyro: tuple[Floats, Floats] | None) -> tuple[float, float]:

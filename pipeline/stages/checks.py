@@ -7,14 +7,13 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, Ints, fit_robustly, robust_spread
-from pipeline.recording import ONE_SCALE, SURE, Finding
-from pipeline.run import LIVE_SHARE, STILL_MPS
+from pipeline.core import Floats, fit_robustly
+from pipeline.recording import SURE, Finding, find_one_ratio
+from pipeline.run import STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages.slip_stage import SlipResult
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
-    LEAST_CORRELATION,
     Samples,
     check_independence,
     check_live_commands,
@@ -49,9 +48,9 @@ def check_side_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return []
     sides = {name: side[live] for name, side in sides.items()}
     turned = sides["pose"][:, 1] - sides["pose"][:, 0]
-    (left, right), _ = fit_robustly(sides["wheels"], turned)
-    (left_ratio, _), _ = fit_robustly(sides["command"], sides["wheels"][:, 0])
-    (_, own_right), _ = fit_robustly(sides["command"], sides["wheels"][:, 1])
+    left, right = fit_robustly(sides["wheels"], turned).gains
+    left_ratio = fit_robustly(sides["command"], sides["wheels"][:, 0]).gains[0]
+    own_right = fit_robustly(sides["command"], sides["wheels"][:, 1]).gains[1]
     if not (left < 0.0 < right and left_ratio > 0.0 and own_right > 0.0):
         return []
     of_command, of_body = float(np.log(left_ratio / own_right)), float(np.log(-left / right))
@@ -92,13 +91,13 @@ _SPEED_TOLERANCE: Final = 0.05
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """Check the steady gain from the measured wheels to the forward motion."""
     moved, steady = samples.velocity[:, 0], samples.steady
-    gain = None if samples.measured is None else find_gain(samples.measured[:, 0], moved, steady)
+    gain = None if samples.measured is None else _find_gain(samples.measured[steady, 0], moved[steady])
     if gain is None or samples.measured is None:
         return []
     if _LEAST < gain < _MOST:
         reached = None
         if samples.body_commanded and samples.command is not None:
-            reached = find_gain(samples.command[:, 0], moved, steady)
+            reached = _find_gain(samples.command[steady, 0], moved[steady])
         if reached is None or abs(reached - 1.0) > _SPEED_TOLERANCE or abs(gain - 1.0) < _LEAST_DIFFERENCE:
             return []
     driven = samples.measured[:, 0]
@@ -123,29 +122,17 @@ def is_grip(gain: float, others: Iterable[float]) -> bool:
 
 
 def find_gain_of(slip: pl.DataFrame) -> float | None:
-    """`find_gain` of the measured wheels of a run, from the rows of its table `slip`."""
-    rows = slip.filter(pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"))
-    return find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy(), ~rows["transitory"].to_numpy())
+    """The steady gain from the measured wheels to the forward motion, from the rows of table `slip`."""
+    rows = slip.filter(
+        pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"), ~pl.col("transitory")
+    )
+    return _find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy())
 
 
-def find_gain(driven: Floats, moved: Floats, steady: Flags) -> float | None:
-    """Median of the forward motion over an ideal one; None if it is not steady.
-
-    Args:
-        driven: ideal forward speed [m/s], shape (n,).
-        moved: measured forward speed [m/s], shape (n,).
-        steady: samples without a change of command, shape (n,).
-    """
-    known = np.isfinite(driven) & np.isfinite(moved) & steady
-    if known.sum() < FEWEST_SAMPLES:
-        return None
-    live = known & (np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven[known]))))
-    if live.sum() < FEWEST_SAMPLES:
-        return None
-    ratio = moved[live] / driven[live]
-    gain = float(np.median(ratio))
-    spread = robust_spread(ratio - gain)
-    return gain if gain > 0.0 and spread <= ONE_SCALE * gain else None
+def _find_gain(driven: Floats, moved: Floats) -> float | None:
+    """Median of the forward motion over an ideal one; None if it is not steady, or backward."""
+    gain = find_one_ratio(moved, driven, FEWEST_SAMPLES)
+    return gain if gain is not None and gain > 0.0 else None
 
 
 # Checks of a whole run: whether the vehicle moves at all, and whether encoders, command and pose agree.
@@ -312,30 +299,19 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
 
 def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     """Report a heading that is later than the position."""
-    ideal = samples.measured if samples.measured is not None else samples.command
+    ideal = samples.measured
     if ideal is None:
         return []
-    findings = []
     known = np.isfinite(ideal).all(axis=1)
-    places = np.flatnonzero(known)
-    along = _delay_of(samples.velocity[:, 0], ideal[:, 0], places, samples)
-    turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], places, samples)
-    if along is not None and turning is not None and samples.measured is not None:
-        skew = turning[0] - along[0]
-        if abs(skew) > max(_SKEW, SURE * float(np.hypot(along[1], turning[1]))):
-            from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
+    times = samples.times[known]
+    along, turning = (
+        estimate_delay(times, samples.velocity[known, axis], times, ideal[known, axis]) for axis in (0, 2)
+    )
+    if along is None or turning is None:
+        return []
+    skew = turning.seconds - along.seconds
+    if abs(skew) <= max(_SKEW, SURE * float(np.hypot(along.deviation, turning.deviation))):
+        return []
+    from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
 
-            name = find_late_effect(Late.HEADING).id
-            findings.append(Finding(name, "warning", "pose", {"value": skew}))
-    return findings
-
-
-def _delay_of(
-    signal: Floats, reference: Floats, places: Ints, samples: Samples
-) -> tuple[float, float] | None:
-    """Delay and standard deviation [s] of a signal against a reference; None if they do not correlate."""
-    times = samples.times[places]
-    delay = estimate_delay(times, signal[places], times, reference[places])
-    if delay is None or abs(delay.correlation) < LEAST_CORRELATION:
-        return None
-    return delay.seconds, delay.deviation
+    return [Finding(find_late_effect(Late.HEADING).id, "warning", "pose", {"value": skew})]

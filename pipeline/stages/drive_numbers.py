@@ -210,9 +210,9 @@ def _measure_lateness(before: Floats, reached: Floats, area: Floats, is_first: F
         # Brakings alone do not tell how long a start takes.
         if (usual & (brakes[used, axis] == 0.0)).sum() < _FEWEST_RESPONSES:
             usual = np.ones_like(usual)
-        estimates, rest = fit_robustly(design[usual], seconds[usual])
-        late = seconds - design @ estimates
-        weight = 1.0 / ((1.0 + size[used, axis] ** -2.0) * max(robust_spread(rest), _FINE_S) ** 2)
+        made = fit_robustly(design[usual], seconds[usual])
+        late = seconds - design @ made.gains
+        weight = 1.0 / ((1.0 + size[used, axis] ** -2.0) * max(robust_spread(made.rest), _FINE_S) ** 2)
         total[used] += weight * late
         weights[used] += weight
     late = np.full(known.size, np.nan)

@@ -2,9 +2,21 @@
 
 import numpy as np
 
-from pipeline.core import ROUNDING_S, SILENT_S, Floats, Ints, arrays, robust_spread
-from pipeline.run import SPAN_S, GyroFit, Track, fit_turning, has_excluded, mark_excluded
+from pipeline.core import (
+    ROUNDING_S,
+    SILENT_S,
+    Floats,
+    Ints,
+    RobustFit,
+    arrays,
+    fit_robustly,
+    robust_spread,
+    weigh_bounded,
+)
+from pipeline.run import SPAN_S, GyroFit, Track, has_excluded, mark_excluded
 
+_EARLY_S, _LONGEST_S = 0.02, 0.8 - ROUNDING_S
+"""See `pair_poses`: stamps vary, and of a span that lasts longer the poses do not tell the turn."""
 _LARGEST_DELAY = 0.7
 """Largest delay of the poses that is tried [s]: those of the recordings are 0.17 to 0.55."""
 _DELAY_STEP = 0.01
@@ -14,7 +26,7 @@ _FEWEST = 40
 _REFINEMENTS = 4
 """Gauss-Newton steps from a start with an error of at most 25 ms."""
 _REWEIGHTED = 3
-"""Iterations of Huber's weights per step."""
+"""Reweightings of a fit."""
 _LEAST_TURNING = 0.02
 """Turning in half a second [rad], median plus standard deviation: ten times the pose noise of 2 mrad."""
 _GOOD = 0.35
@@ -38,7 +50,7 @@ def fit_gyro(  # noqa: PLR0911 - each way out is a reason
     times, rate = gyro
     if times.size < _FEWEST or _measure_cover(times, track.times) < _LEAST_COVERED:
         return None
-    first, second = _pair_up(track, excluded)
+    first, second = pair_poses(track, excluded, early_s=_EARLY_S, longest_s=_LONGEST_S)
     if first.size < _FEWEST:
         return None
     start, end = track.times[first], track.times[second]
@@ -53,17 +65,20 @@ def fit_gyro(  # noqa: PLR0911 - each way out is a reason
     if start.size < _FEWEST:
         return None
 
-    def judge(delay: float) -> tuple[float, float, float]:
+    def judge(delay: float) -> RobustFit:
         seen = np.interp(end - delay, times, angle) - np.interp(start - delay, times, angle)
-        return fit_turning(seen, end - start, turned)
+        return fit_robustly(
+            np.column_stack((seen, end - start)), turned, measure=robust_spread, rounds=_REWEIGHTED
+        )
 
-    coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP)
-    best = float(coarse[np.argmin([judge(float(d))[2] for d in coarse])])
-    scale, bias, loss = judge(best)
-    residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
+    coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP).tolist()
+    best = coarse[int(np.argmin([judge(delay).scale for delay in coarse]))]
+    made = judge(best)
+    scale, bias = made.gains.tolist()
+    residual = made.scale / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
     if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
         return None
-    _, _, delay, error = _refine((times, angle), (start, end), turned, (scale, bias, best))
+    delay, error = _refine((times, angle), (start, end), turned, (scale, bias, best))
     # Pose errors must not change the scale by a fraction of a percent: it is fitted to longer stretches.
     return GyroFit(*_fit_scale(track, (times, angle), delay, excluded), delay, error, residual)
 
@@ -73,8 +88,8 @@ def _refine(
     span: tuple[Floats, Floats],
     turned: Floats,
     values: tuple[float, float, float],
-) -> tuple[float, float, float, float]:
-    """Scale, bias and delay by robust Gauss-Newton steps, with the standard error of the delay.
+) -> tuple[float, float]:
+    """Delay [s] by robust Gauss-Newton steps, and its standard error.
 
     Args:
         gyro: times [s] and integrated rate [rad], each of shape (m,).
@@ -94,21 +109,12 @@ def _refine(
         # Derivative of the turned angle with respect to the delay.
         slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
         design = np.column_stack((turn(delay), end - start, slope))
-        target = turned - design[:, :2] @ np.array([scale, bias])
-        weight, step = np.ones(target.size), np.zeros(3)
-        for _ in range(_REWEIGHTED):
-            rows = design * weight[:, None]
-            step = np.linalg.lstsq(rows.T @ design, rows.T @ target, rcond=None)[0]
-            rest = np.abs(target - design @ step)
-            spread = robust_spread(rest) + 1e-9
-            weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))
-        scale, bias = scale + float(step[0]), bias + float(step[1])
-        delay += float(np.clip(step[2], -5 * _DELAY_STEP, 5 * _DELAY_STEP))
-        bread = np.linalg.pinv((design * weight[:, None]).T @ design)
-        pulls = np.zeros((int(unit.max()) + 1, 3))
-        np.add.at(pulls, unit, design * ((target - design @ step) * weight)[:, None])
-        error = float(np.sqrt(max((bread @ (pulls.T @ pulls) @ bread)[2, 2], 0.0)))
-    return scale, bias, delay, error
+        rest = turned - design[:, :2] @ np.array([scale, bias])
+        step = fit_robustly(design, rest, measure=robust_spread, weigh=weigh_bounded, rounds=_REWEIGHTED)
+        scale, bias = scale + float(step.gains[0]), bias + float(step.gains[1])
+        delay += float(np.clip(step.gains[2], -5 * _DELAY_STEP, 5 * _DELAY_STEP))
+        error = float(step.find_errors(design, unit)[2])
+    return delay, error
 
 
 def _fit_scale(
@@ -130,36 +136,39 @@ def _fit_scale(
     ends = np.diff(track.segment, prepend=-1) != 0
     ends |= np.diff(arrays.number_stretches(track.times - track.times[0]), prepend=-1) != 0
     ends |= np.diff(is_out, prepend=False)
-    piece = np.cumsum(ends)[mask]
-    columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[mask]
-    weight, fitted = np.ones(piece.size), np.zeros(2)
-    for _ in range(_REWEIGHTED):
-        total = np.maximum(np.bincount(piece, weight), 1e-12)
-        means = np.column_stack([np.bincount(piece, weight * one) for one in columns.T]) / total[:, None]
-        rest = columns - means[piece]
-        rows = rest[:, :2] * weight[:, None]
-        fitted = np.linalg.lstsq(rows.T @ rest[:, :2], rows.T @ rest[:, 2], rcond=None)[0]
-        size = np.abs(rest[:, 2] - rest[:, :2] @ fitted)
-        spread = robust_spread(size) + 1e-9
-        weight = np.minimum(1.0, 3.0 * spread / np.maximum(size, 1e-12))
-    return float(fitted[0]), float(fitted[1])
+    piece = np.unique(np.cumsum(ends)[mask], return_inverse=True)[1]
+    design = np.column_stack((np.interp(at, times, angle), at))[mask]
+    heading = track.heading[mask]
+    made = fit_robustly(
+        design, heading, measure=robust_spread, weigh=weigh_bounded, group=piece, rounds=_REWEIGHTED
+    )
+    scale, bias = made.gains.tolist()
+    return scale, bias
 
 
 def _measure_cover(times: Floats, at: Floats) -> float:
     """Share of times with a gyro message nearby: a gyro that stopped half-way is no source of heading."""
-    next_one = np.minimum(np.searchsorted(times, at), times.size - 1)
-    nearest = np.minimum(np.abs(times[next_one] - at), np.abs(times[np.maximum(next_one - 1, 0)] - at))
-    return float(np.mean(nearest < SILENT_S))
+    near = times[arrays.nearest_indices(at, times)]
+    return float(np.mean(np.abs(near - at) < SILENT_S))
 
 
-def _pair_up(track: Track, excluded: Floats) -> tuple[Ints, Ints]:
-    """Poses half a second apart in one segment, outside bad stretches."""
-    second = np.searchsorted(track.times, track.times + SPAN_S - 0.02)
-    first = np.arange(track.times.size)
-    mask = second < track.times.size
-    first, second = first[mask], second[mask].astype(np.int64)
-    mask = (track.segment[first] == track.segment[second]) & (
-        track.times[second] - track.times[first] < 0.8 - ROUNDING_S
-    )
-    mask &= ~has_excluded(excluded, track.times[first], track.times[second])
-    return first[mask], second[mask]
+def pair_poses(track: Track, excluded: Floats, *, early_s: float, longest_s: float) -> tuple[Ints, Ints]:
+    """Poses of one segment half a second apart, and those before and after a longer wait.
+
+    Args:
+        track: the poses.
+        excluded: times [s] that are in none of the spans, increasing.
+        early_s: by how much a span may be shorter.
+        longest_s: length of a span that is too long.
+
+    Returns:
+        The first and the last pose of every span, shape (k,) each.
+    """
+    times = track.times
+    last = np.searchsorted(times, times + SPAN_S - early_s).astype(np.int64)
+    first = np.flatnonzero(last < times.size)
+    last = last[first]
+    begin, end = times[first], times[last]
+    mask = (track.segment[first] == track.segment[last]) & (end - begin < longest_s)
+    mask &= ~has_excluded(excluded, begin, end)
+    return first[mask], last[mask]

@@ -17,7 +17,7 @@ from pipeline.run import (
 )
 from pipeline.sources import Vehicle
 from pipeline.stages.inputs import Ideal
-from pipeline.stages.spans import LIVE, USUAL_S, Rims, Span, Spans, gather_rims, mark_excluded
+from pipeline.stages.spans import LIVE, USUAL_S, Rims, Span, Spans, gather_rims, mark_incidents
 from schemas import tabulate
 
 _FALSE_MOTION = {"pushed", "localization_frozen"}
@@ -61,7 +61,7 @@ def find_events(
     if rims is not None and rims.driven is not None:
         fastest, driven = np.abs(rims.driven).sum(axis=1), np.nan_to_num(rims.driven)
         unknown = spans.wrong | np.isnan(fastest)
-        unknown |= mark_excluded(times, [one for one in spans.incidents if one.kind in _FALSE_MOTION])
+        unknown |= mark_incidents(times, [one for one in spans.incidents if one.kind in _FALSE_MOTION])
         moved = _smooth(times, rims.moved)
         gain = _measure_gain(rims, driven[:, 0], moved[:, 0])
         limits = find_limits(rims.top, gain)

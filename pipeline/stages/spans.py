@@ -21,10 +21,10 @@ from pipeline.core import (
     Floats,
     find_runs,
     find_scale,
+    fit_robustly,
     list_likelihoods,
     number_stretches,
     recur,
-    weigh,
 )
 from pipeline.recording import BLOCK_S, LASTS_NATS, Finding, follow_likeliest, price_change
 from pipeline.run import ANSWERS_S, LIVE_SHARE, STILL_MPS
@@ -33,7 +33,7 @@ from pipeline.stages.inputs import Ideal
 
 Kind = Literal[
     "emergency_stop", "side_stopped", "manual_driving", "pushed", "commands_silent", "stuck",
-    "localization_frozen", "rotated", "lost",
+    "localization_frozen", "rotated", "lost", "outlier",
 ]  # fmt: skip
 
 _INCIDENTS = {
@@ -59,8 +59,6 @@ While the source drives, what a fit does not know lasts, too: there the end cost
 """
 _FEWEST_BLOCKS = 40
 """Least number of blocks for a fit of eighteen coefficients."""
-_ROUNDS = 8
-"""Reweighting iterations."""
 _FEWEST_AT_REST = 8
 """Least number of blocks at rest for the noise at rest: two of them are below their quartile."""
 _QUARTILE = 0.3186
@@ -71,7 +69,7 @@ _LEAST_AT_REST = 0.1 * STILL_MPS
 _FRICTIONS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3)
 """Fractions of the usual largest speed up to which a command may not overcome friction: the likeliest."""
 _TINY = 1e-3
-"""Share of a column's power that is added to it: what a short run does not determine stays small."""
+"""See `fit_robustly`: what a short run does not determine stays small."""
 _SLOW_S = 1.0
 """Time constant of the slowest of the lags that a fit mixes [s]."""
 _COASTS_S = 3.0
@@ -84,12 +82,18 @@ USUAL_S = 300.0
 
 
 class Span(NamedTuple):
-    """Kind of a contradiction, its start and its end [s], and its gain in log-likelihood."""
+    """A contradiction of poses, wheels and commands.
+
+    Attributes:
+        kind: of it.
+        start, end: [s].
+        value: its gain in log-likelihood; of an outlier its size over the least one.
+    """
 
     kind: Kind
     start: float
     end: float
-    nats: float
+    value: float
 
 
 @dataclass(frozen=True)
@@ -153,12 +157,17 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
     return Rims(times, asked, known, expired, driven, moved, top)
 
 
-def mark_excluded(times: Floats, incidents: Sequence[Span]) -> Flags:
+def mark_spans(times: Floats, spans: Sequence[Span], *, before_s: float = 0.0, after_s: float = 0.0) -> Flags:
+    """Times in some spans, or up to some time before or after one, shape (n,)."""
+    inside = np.zeros(times.size, dtype=bool)
+    for one in spans:
+        inside |= (times >= one.start - before_s) & (times <= one.end + after_s)
+    return inside
+
+
+def mark_incidents(times: Floats, incidents: Sequence[Span]) -> Flags:
     """Samples that incidents exclude, shape (n,)."""
-    excluded = np.zeros(times.size, dtype=bool)
-    for one in incidents:
-        excluded |= (times >= one.start - _MARGIN_S) & (times <= one.end + _COASTS_S)
-    return excluded
+    return mark_spans(times, incidents, before_s=_MARGIN_S, after_s=_COASTS_S)
 
 
 def find_spans(
@@ -189,9 +198,7 @@ def find_spans(
     spans.sort(key=lambda one: one.start)
     incidents = tuple(one for one in spans if one.kind in _INCIDENTS)
     bad = [one for one in spans if one.kind not in _INCIDENTS]
-    wrong = np.zeros(times.size, dtype=bool)
-    for one in bad:
-        wrong |= (times >= one.start) & (times <= one.end)
+    wrong = mark_spans(times, bad)
     if bad:
         findings.append(_report_poses(bad, wrong, rims))
     about = {"commands_silent": "command", "localization_frozen": "pose"}
@@ -206,7 +213,7 @@ def find_spans(
         )
         for one in incidents
     ]
-    return Spans(wrong, mark_excluded(times, incidents), tuple(findings), incidents)
+    return Spans(wrong, mark_incidents(times, incidents), tuple(findings), incidents)
 
 
 def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
@@ -385,29 +392,17 @@ def _fit(
     fits = []
     for friction in _FRICTIONS if is_command else _FRICTIONS[:1]:
         columns = blocks.list_columns(source, top, friction)
-        solved = [_solve(columns[rows], values[:, i], least) for i in range(3)]
-        gains = np.column_stack([one[0] for one in solved])
-        moving = np.hypot([find_scale(one[1]) for one in solved], least)
+        made = [
+            fit_robustly(columns[rows], values[:, i], measure=find_scale, least=least, ridge=_TINY)
+            for i in range(3)
+        ]
+        gains, moving = np.column_stack([one.gains for one in made]), np.array([one.scale for one in made])
         expected = columns @ gains
         # Of what comes to rest as much is unknown as is expected to be left of its motion.
         settling = np.minimum(np.hypot(at_rest, expected), moving)
         scale = np.where(rests[:, None], settling, moving)
         fits.append(_Fit(top, friction, gains, target, expected, scale, spread, is_judged, rests))
     return max(fits, key=lambda one: one.total)
-
-
-def _solve(columns: Floats, values: Floats, least: float) -> tuple[Floats, Floats]:
-    """Coefficients and residuals of a robust regression; below the least difference all fit alike."""
-    size = np.sqrt(np.mean(columns**2, axis=0)) + _TINY
-    design, weight = columns / size, np.ones(values.size)
-    ridge = _TINY * values.size * np.eye(size.size)
-    gains, rest = np.zeros(size.size), values
-    for _ in range(_ROUNDS):
-        weighted = design * weight[:, None]
-        gains = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ values)
-        rest = values - design @ gains
-        weight = weigh(rest, math.hypot(find_scale(rest), least))
-    return gains / size, rest
 
 
 _LONG_PAUSE_S = 2.0

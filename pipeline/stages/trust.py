@@ -24,7 +24,7 @@ _FEWEST_OF_DELAY = 50
 FEWEST_SAMPLES = 100
 """Least number of grid samples for any check: five seconds at 20 Hz. Half and double change no finding of
 two recordings."""
-LEAST_CORRELATION = 0.7
+_LEAST_CORRELATION = 0.7
 """Correlation below which a lag is meaningless: at this value the signals share half of their power."""
 
 
@@ -57,7 +57,7 @@ def estimate_delay(
         largest: largest lag tried, in both directions [s].
 
     Returns:
-        The delay; None if either signal is constant or there are fewer than `_FEWEST_OF_DELAY` samples.
+        The delay; None if the signals do not correlate, or there are fewer than `_FEWEST_OF_DELAY` samples.
     """
     if min(times.size, reference_times.size) < _FEWEST_OF_DELAY:
         return None
@@ -70,6 +70,8 @@ def estimate_delay(
         [_correlate(centred, spread, np.interp(times - lag, reference_times, reference)) for lag in lags]
     )
     best = int(np.argmax(np.abs(scores)))
+    if abs(scores[best]) < _LEAST_CORRELATION:
+        return None
     sign = np.sign(scores[best]) or 1.0
     tall = sign * scores
     if 0 < best < lags.size - 1:
@@ -236,10 +238,11 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
     """
     if drifted.size < _FEWEST_SPANS:
         return False
-    (half_step,), rest = fit_robustly(swung[:, None], drifted)
+    made = fit_robustly(swung[:, None], drifted)
+    half_step = float(made.gains[0])
     drift = float(np.median(np.abs(half_step * swung)))
     known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
-    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * SPAN_S)
+    regular = float(np.median(np.abs(made.rest))) <= max(_UNEVEN * drift, _SIDEWAYS * SPAN_S)
     return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
@@ -339,9 +342,9 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     design, moved = _arrange(samples, samples.measured, first, last)
     stretch = np.minimum(np.arange(first.size) * _BLOCKS // first.size, _BLOCKS - 1)
-    whole = fit_robustly(design, moved)[0]
+    whole = fit_robustly(design, moved).gains
     others = [stretch != one for one in range(_BLOCKS)]
-    without = np.array([fit_robustly(design[rows], moved[rows])[0] for rows in others])
+    without = np.array([fit_robustly(design[rows], moved[rows]).gains for rows in others])
     pair, pairs = whole[1:3], without[:, 1:3]
     freedom = _BLOCKS - 1.0
     centred = pairs - pairs.mean(axis=0)

@@ -70,8 +70,8 @@ def decode_checked(data: bytes) -> dict[str, object]:
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs."""
-LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored")
-"""What became of a log of a batch, as its note says; each log counts once."""
+LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored", "gone")
+"""What became of a log of a batch; each log counts once, and each run has one log."""
 
 
 NOTES = ("batch/", "identities/")

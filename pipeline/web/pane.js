@@ -213,7 +213,7 @@ export class Pane {
     const kept = choice.value;
     choice.replaceChildren(choice.firstElementChild, ...others.map((one) => h("option", { value: one.run }, [one.run, one.terrain].filter(Boolean).join(" · "))));
     choice.value = others.some((one) => one.run === kept) ? kept : "";
-    choice.closest(".validation").hidden = !others.length;
+    choice.closest(".validation").hidden = !others.length || Boolean(run.refusal);
   }
 
   // Anew whenever the model is another one; what was asked for a model before it is not shown.

@@ -31,7 +31,7 @@ else:
                 "format_markdown",
                 "list_check_lines",
                 "list_check_sentences",
-                "list_compared",
+                "list_sides",
                 "tabulate_check",
                 "tabulate_limits",
             ),

@@ -29,8 +29,8 @@ Line = tuple[str, str]
 _MOST = 3
 """Numbers in a sentence; the table lists all."""
 _HEAD = (
-    Column("result", wide=True),
     Column("number"),
+    Column("result", wide=True),
     Column("before -> after"),
     Column("difference [95 %]"),
     Column("p"),
@@ -173,7 +173,7 @@ def tabulate_check(check: RunsCheck) -> Table:
         before, after = _format(one, one.before), _format(one, one.after)
         before = before.removesuffix(f" {after.partition(' ')[2]}")
         status = Cell(one.status, strong=one.status == "changed")
-        rows.append([status, one.title, f"{before} -> {after}", difference, _format_p(one), spread])
+        rows.append([one.title, status, f"{before} -> {after}", difference, _format_p(one), spread])
     note = _ABOUT if check.is_spread_known else _ALONE
     return Table("Numbers before and after", _HEAD, rows, note).drop_empty()
 
@@ -195,15 +195,12 @@ def tabulate_limits(check: RunsCheck) -> Table:
     return Table("Limits", (Column("limit"), Column("measured"), Column("outcome")), rows)
 
 
-def list_compared(check: RunsCheck) -> list[Line]:
-    """The runs of both sides, and others of the robot on these terrains."""
+def list_sides(check: RunsCheck) -> dict[str, list[str]]:
+    """Names of the runs of both sides, and of those that tell how much runs differ."""
     sides = check.sides
     others = [one for runs in sides.others.values() for one in runs]
-    return [
-        (label, f"{len(runs)}: {', '.join(one.run for one in runs)}")
-        for label, runs in (("before", sides.before), ("after", sides.after), ("others", others))
-        if runs
-    ]
+    groups = {"before": sides.before, "after": sides.after, "others": others}
+    return {label: [one.run for one in runs] for label, runs in groups.items() if runs}
 
 
 def list_check_lines(check: RunsCheck) -> list[Line]:
@@ -211,10 +208,11 @@ def list_check_lines(check: RunsCheck) -> list[Line]:
     lines = [("verdict", format_check(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     table = tabulate_check(check)
-    labels = ["", *(str(row[0]) for row in table.rows)]
+    labels = ["", *(one.status for one in check.numbers)]
     lines += zip(labels, table.align(), strict=False)
     lines += [("", table.note)] if table.note else []
-    return [*lines, *list_compared(check), *(("note", note) for note in check.sides.notes)]
+    lines += [(label, f"{len(runs)}: {', '.join(runs)}") for label, runs in list_sides(check).items()]
+    return lines + [("note", note) for note in check.sides.notes]
 
 
 def format_markdown(check: RunsCheck) -> str:

@@ -98,7 +98,7 @@ def tabulate_datasets(answer: Answer, source: str) -> Table:
     frame = answer.datasets.filter(pl.col("input").cast(pl.String) == source)
     columns = [Column("dataset"), Column("runs", number=True)]
     for quantity in quantities:
-        columns += [Column(QUANTITIES[quantity], "m/s", number=True), Column("95 %")]
+        columns += [Column(QUANTITIES[quantity], "m/s", number=True), Column("95 %", number=True)]
     columns += [
         Column("interval", wide=True),
         Column("2 s window norm", "m/s", number=True, wide=True),
@@ -146,9 +146,9 @@ def tabulate_pairs(answer: Answer, view: tuple[str, str]) -> Table:
     numbers = ("Cliff's delta", "p", "spread of runs", "freedom", "overlap of driving")
     columns = (
         Column("times as much slip"),
-        Column("ratio [95 %]"),
+        Column("ratio [95 %]", number=True),
         Column("p adjusted", number=True),
-        Column("difference [95 %]", "m/s", wide=True),
+        Column("difference [95 %]", "m/s", number=True, wide=True),
         *(Column(title, number=True, wide=True) for title in numbers),
         *(Column(title, wide=True) for title in ("size", "method", "note")),
     )
@@ -358,14 +358,15 @@ def tabulate_causes(causes: Causes) -> list[Table]:
         for part in one.parts
     ]
     head = (Column("dataset"), Column("cause"))
-    shares = (*head, Column("share", number=True), Column("95 %"))
+    shares = (*head, Column("share", number=True), Column("95 %", number=True))
     parts = (
         *head,
         Column("difference", "m/s", number=True),
-        Column("95 %"),
+        Column("95 %", number=True),
         Column("p adjusted", number=True),
     )
+    caption = "Differences of RMS slip by cause; p over the causes of a pair"
     return [
-        Table("Budgets: shares of the mean square slip, means over runs", shares, budgets),
-        Table("Differences of RMS slip by cause; p over the causes of a pair", parts, differences),
+        Table("Budgets: shares of the mean square slip, means over runs", shares, budgets).drop_empty(),
+        Table(caption, parts, differences).drop_empty(),
     ]

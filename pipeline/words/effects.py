@@ -9,8 +9,8 @@ from pipeline.models import (
     Effect,
     Late,
     Level,
+    Meaning,
     Number,
-    Reading,
     find_effect,
     list_effects,
     name_term,
@@ -102,7 +102,7 @@ def describe_number(effect: str, parameter: str) -> str:
     return "" if kind is None else kind().parameter(parameter).about.partition(" (")[0]
 
 
-def list_readings(effect: Named) -> tuple[Reading, ...]:
+def list_readings(effect: Named) -> tuple[Meaning, ...]:
     """Its meanings as a property of the vehicle, the ground or the run, which one run cannot separate."""
     kind = _list_known().get(effect.id)
     known = () if kind is None else kind.readings

@@ -24,8 +24,8 @@ from pipeline.results import (
     Moments,
     Region,
     RunDiagnosis,
-    Span,
     Step,
+    Stretch,
     Unexplained,
     list_excess,
 )
@@ -117,7 +117,7 @@ def describe_moments(moments: Moments) -> str:
     )
 
 
-def name_span(span: Span) -> str:
+def name_span(span: Stretch) -> str:
     """A span with its share of the error."""
     return f"{span.t_start:.0f} to {span.t_end:.0f} s ({format_share(span.share, 0)})"
 

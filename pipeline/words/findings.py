@@ -497,8 +497,8 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "kept_command": "in {count} pauses the vehicle continues its last command until the next, for up to "
     "{value:.1f} s beyond command.hold_s: the base holds its last command; set command.hold_s to the longest "
     "pause to include these stretches",
-    "emergency_stop": "the vehicle stood still under live commands: an emergency stop, or the drive was off; "
-    "left out of all fits",
+    "emergency_stop": "the vehicle stood still under live commands: an emergency stop, the drive was off, or "
+    "it was too weak to move; left out of all fits",
     "side_stopped": "the wheels of one side stood under live commands: one was stuck, or its motor off; left "
     "out of all fits",
     "manual_driving": "the vehicle moved without a command: by joystick, another controller, or a push; left "
@@ -1120,8 +1120,8 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "odometry_contradicts_itself": {"pose": _contradicts_itself, "speeds": _contradicts_itself},
     "pose_contradicts_itself": "the pose of {source} is wrong, and nothing else shows the motion: no other "
     "pose is recorded, nor wheels that follow the command",
-    "pose_of_another": "{pose} is taken for the pose, and not {other}: the vehicle moves as it does; the "
-    "other is of another body",
+    "pose_of_another": "{pose} is taken for the pose, and not {other}: what drives the vehicle explains the "
+    "one better",
     "topic_left_out": "{where} is left out: {why}",
     "ground_unobservable": "the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so "
     "that the drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
@@ -1181,6 +1181,8 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "command_timeout": {"held": _command_timeout, "in bursts": _commands_in_bursts},
     "command_delay": _command_delay,
     "command_late": _command_late,
+    "speeds_of_positions": "its speeds are differences of its positions, and scatter as the times between "
+    "its messages do: they are taken over two of its readings",
     "wheels_unsigned": "not used: {wheels}: its speeds have no sign: they are never below zero, though the "
     "body is driven forward and backward",
     "not_driven": {

@@ -43,14 +43,14 @@ def tabulate_fleet(fleet: Fleet, *, everything: bool = True) -> list[Table]:
         hidden = len(own) - len(shown)
         note = f"{format_count(hidden, 'more parameter')}: --all, or the page" if hidden else ""
         tables.append(Table(f"{vehicle}: {format_count(len(runs), 'run')}", _FLEET, rows, note))
-    return [one for one in tables if one.rows]
+    return [one.drop_empty() for one in tables if one.rows]
 
 
 _FLEET = (
     Column("parameter"),
     Column("value", number=True),
-    Column("95 %"),
-    Column("another run"),
+    Column("95 %", number=True),
+    Column("another run", number=True),
     Column("unit"),
     Column("level"),
     Column("runs", number=True, wide=True),

@@ -58,6 +58,9 @@ def format_verdict(run: RunDiagnosis) -> str:
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
     opening = f"Over {HORIZON_S:g} s the ideal model is {format_step(ladder[0])} off"
     scope = [NO_GROUND] if has_no_pose(run.findings) else []
+    is_sized = not math.isnan(ladder[0].t_mrmse_m)
+    if not is_sized:
+        opening = "No stretch of good poses is long enough to tell an error"
     if len(ladder) == 1:
         return _join(f"{opening}{_compare(run)}", *_format_nothing(run), *scope)
     clauses = _list_clauses(run)
@@ -67,9 +70,8 @@ def format_verdict(run: RunDiagnosis) -> str:
     verdict = ""
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
         clause = f"{_join_clauses(clauses[:count])}; " if count else ""
-        verdict = _join(
-            opening, f"{clause}with {_name_model(ladder[-1], count)} in the model {remaining}", *rest
-        )
+        after = f"{clause}with {_name_model(ladder[-1], count)} in the model {remaining}"
+        verdict = _join(opening, *([after] if is_sized else filter(None, [clause[:-2]])), *rest)
         if len(verdict) <= _LONGEST:
             break
     suggested = f"{verdict[:-1]}{_suggest(run)}."

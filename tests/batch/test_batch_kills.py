@@ -130,34 +130,42 @@ def test_a_batch_killed_with_all_its_workers_goes_on(originals: Path, tmp_path: 
     season = tmp_path / "season"
     name_logs_after_calls(originals, season, (call, 50, 60))
     batch(season, tmp_path / "clean")
-    code = (
-        "import sys; from pathlib import Path; from batch_tools import batch; from batch_works import *;"
-        "batch(Path(sys.argv[1]), Path(sys.argv[2]), work=work_killing_the_batch, executor='local')"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, season, tmp_path / "out"],
-        start_new_session=True,
-        env=os.environ | {"DIE_AT": str(call), "PYTHONPATH": IMPORTABLE},
-    )
+    process = start_batch_of("work_killing_the_batch", season, tmp_path, DIE_AT=str(call))
     assert process.wait(60) == -signal.SIGKILL
     assert Store(tmp_path / "out").examine().problems == ()
     batch(season, tmp_path / "out")
     assert read_tables(tmp_path / "out") == read_tables(tmp_path / "clean")
 
 
-def test_workers_end_with_their_batch(field: Path, tmp_path: Path) -> None:
-    process = start_slip(
-        "batch", field, "--results", tmp_path / "out", "--jobs", "2", "--settle", "0", "--quiet"
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_workers_end_with_their_batch(field: Path, tmp_path: Path, ending: signal.Signals) -> None:
+    process = start_batch_of("work_slowly", field, tmp_path, PAUSE_S="600", BEGUN=str(tmp_path))
+    wait_until(lambda: len(list(tmp_path.glob("*-*"))) >= 2)
+    process.send_signal(ending)
+    process.wait(10)
+    # A claim ends with the process that holds it.
+    assert wait_until(lambda: list_group(process.pid) == []), list_group(process.pid)
+
+
+def start_batch_of(work: str, logs: Path, folder: Path, **variables: str) -> subprocess.Popen[bytes]:
+    """A batch of two workers in a process group of its own, with results in `out` of a folder."""
+    code = (
+        "import sys; from pathlib import Path; from batch_tools import batch; import batch_works;"
+        f"batch(Path(sys.argv[1]), Path(sys.argv[2]), work=batch_works.{work}, executor='local')"
     )
-    deadline = time.monotonic() + 30.0
-    while not list((tmp_path / "out").glob("runs/*/*/manifest.json")) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.kill()
-    process.communicate()
-    deadline = time.monotonic() + 20.0
-    while list_group(process.pid) and time.monotonic() < deadline:
+    return subprocess.Popen(
+        [sys.executable, "-c", code, logs, folder / "out"],
+        start_new_session=True,
+        env=os.environ | {"PYTHONPATH": IMPORTABLE, **variables},
+    )
+
+
+def wait_until(is_so: Callable[[], bool], seconds: float = 30.0) -> bool:
+    """Whether something becomes so."""
+    deadline = time.monotonic() + seconds
+    while not is_so() and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert list_group(process.pid) == []
+    return is_so()
 
 
 def list_group(group: int) -> list[int]:

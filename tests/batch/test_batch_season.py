@@ -59,7 +59,8 @@ def test_a_season_with_good_and_bad_logs(season: Path, tmp_path: Path) -> None:
 
 
 def test_the_bytes_are_those_of_one_log_after_the_other(season: Path, tmp_path: Path) -> None:
-    batch(season, tmp_path / "many", executor="local")
+    outcome = batch(season, tmp_path / "many", executor="local")
+    assert counts(outcome) == {"done": 4}, [line.reason for line in outcome.lines]
     one = ask(season, tmp_path / "one").options
     for log in sorted(season.glob("*.mcap")):
         analyze_log(log, one)
@@ -124,6 +125,36 @@ def test_a_changed_log_takes_the_place_of_the_old_one(season: Path, tmp_path: Pa
     manifest = Store(out).manifest("season/c")
     assert manifest is not None
     assert len(list_old(manifest)) == 1
+
+
+def test_a_moved_log_is_the_same_run_and_counts_once(season: Path, tmp_path: Path) -> None:
+    out, moved = tmp_path / "out", tmp_path / "moved"
+
+    def count(logs: Path) -> dict[str, int]:
+        batch(logs, out)
+        return {state: number for state, number in read_status(Store(out)).counts.items() if number}
+
+    assert count(season) == {"done": 4}
+    season.rename(moved)
+    for _ in range(2):
+        assert count(moved) == {"done": 4}
+    # Where the old ones are back as well, the first by name is the log of the run, whatever was before.
+    shutil.copytree(moved, season)
+    both = tmp_path / "both"
+    both.mkdir()
+    season.rename(both / "season")
+    moved.rename(both / "moved")
+    for _ in range(2):
+        assert count(both) == {"done": 4, "copy": 4}
+    states = {str(Path(one.log.path).relative_to(both)): one.state for one in read_status(Store(out)).entries}
+    assert {states[f"moved/{name}.mcap"] for name in "abcd"} == {"done"}
+    # Of a log that is gone the copy takes the run; without one it is gone, and not done.
+    shutil.rmtree(both / "moved")
+    assert count(both) == {"done": 4}
+    (both / "season" / "a.mcap").unlink()
+    for _ in range(2):
+        assert count(both) == {"done": 3, "gone": 1}
+    assert Store(out).runs() == tuple(f"season/{name}" for name in "abcd")
 
 
 def test_logs_of_one_name_get_runs_of_their_own(season: Path, tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def slip_number(name: str) -> object:
 
 def test_limits_gate_a_build_and_the_report_is_a_file(place: Path) -> None:
     (place / "check.toml").write_text('[parameter]\n"drive_lag.tau" = {max = 0.5}\n', encoding="utf-8")
-    options = ("--limits", "check.toml", "--to", "junit", "--file", "check.xml", "--quiet")
+    options = ("--limits", "check.toml", "--to", "junit", "--file", "check.xml", "--force", "--quiet")
 
     check(place, "husky.toml", "logs/b.mcap", *options, code=0)
     kept = (place / "check.xml").read_text(encoding="utf-8")
@@ -96,7 +96,7 @@ def test_the_page_of_a_check_is_a_file_that_shows_the_table_of_the_screen(place:
     text = html.unescape(re.sub(r"<[^>]+>", " ", page))
     (row,) = (line for line in screen.splitlines() if line.startswith("changed"))
     for cell in re.split(r" {2,}", row):
-        assert cell.replace("-> ", "") in text.replace("-> ", ""), cell
+        assert cell.replace("->", "\u2192") in text, cell
     assert page.startswith("<!DOCTYPE html>")
     assert "script-src 'none'" in page
     assert (place / "logs/late.mcap").stem in text, "the compared runs are named"

@@ -94,7 +94,7 @@ def test_a_plan_speaks_of_all_that_is_not_observable_and_of_what_no_plan_can_sho
     run = json.loads(run_verb("diagnose", "run.mcap", "--json", cwd=place).stdout)["runs"][0]
     hidden = set(run["unobservable"])
     assert hidden
-    plan = json.loads(run_verb("plan", "run.mcap", "--json", cwd=place).stdout)
+    plan = json.loads(run_verb("plan", "run.mcap", "--force", "--json", cwd=place).stdout)
     asked = {name for one in (*plan["promises"], *plan["impossible"]) for name in one["effects"]}
     assert hidden <= asked
     on_slopes = {name for name in hidden if Excitation.SLOPE in find_effect(name).needs}

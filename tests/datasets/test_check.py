@@ -305,7 +305,7 @@ def test_every_format_says_the_same_and_markup_in_a_name_stays_text(late: Sides)
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert failed == [LAG]
     assert suite.get("failures") == "1"
-    assert "| changed | lag of the drive | 0." in markdown
+    assert "| lag of the drive | changed | 0." in markdown
     assert "<b>" not in markdown
     assert "\x1b" not in markdown
 

@@ -18,7 +18,7 @@ from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, measure
 from pipeline.estimation.estimation_data import prepare_data
 from pipeline.estimation.fit import fit_path, make_folds
 from pipeline.estimation.intervals import estimate_path
-from pipeline.estimation.matrix import Change, Matrix
+from pipeline.estimation.matrix import Matrix, Move
 from pipeline.estimation.model_state import ModelState
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Timing, find_effect
@@ -191,7 +191,7 @@ def test_the_matrix_knows_what_a_set_costs_before_it_is_fitted() -> None:
     made, found, _ = search(drive({"effective_track": 1.3, "lateral_skid": 0.3}))
     matrix = made.make_matrix(found.start)
     ids = [trial.effect.id for trial in matrix.trials]
-    both = Change().add(ids.index("effective_track")).add(ids.index("lateral_skid"))
+    both = Move().add(ids.index("effective_track")).add(ids.index("lateral_skid"))
     states = matrix.list_states(both)
     assert {*states[0].ids} == {"effective_track", "lateral_skid"}
     for name, value in (("effective_track", 1.3), ("lateral_skid", 0.3)):
@@ -199,7 +199,7 @@ def test_the_matrix_knows_what_a_set_costs_before_it_is_fitted() -> None:
         assert effect is not None
         assert next(iter(effect.values.values())) == pytest.approx(value, rel=0.25)
     assert (
-        matrix.expect_change(both) < matrix.expect_change(Change().add(ids.index("effective_track"))) < -100.0
+        matrix.expect_change(both) < matrix.expect_change(Move().add(ids.index("effective_track"))) < -100.0
     )
     assert not np.isfinite(matrix.measure(both.add(ids.index("effective_track"))))
 

@@ -16,10 +16,10 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import NORMAL_95
 from pipeline.estimation import (
     Diagnosis,
+    DiagnosisInput,
     Estimates,
     EstimationData,
     Input,
-    Recording,
     diagnose_runs,
     load_recording,
 )
@@ -44,7 +44,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate import (
-    Recording as Recorded,
+    DiagnosisInput as Recorded,
 )
 from pipeline.sources import Vehicle, find_preset
 from pipeline.words.diagnosis import describe, list_lines
@@ -57,13 +57,13 @@ _SCENE = Scenario(
 )
 
 
-def _record(scenario: Scenario, folder: Path) -> tuple[Recording, Vehicle]:
+def _record(scenario: Scenario, folder: Path) -> tuple[DiagnosisInput, Vehicle]:
     log = folder / "run.mcap"
     write_log(simulate_run(scenario), log)
     manifest = analyze_log(log, Options(out=folder / "out", report=False)).manifest
     vehicle = find_preset(scenario.vehicle.name)
     assert vehicle is not None
-    return Recording(manifest.run, {name: manifest.read(name) for name in manifest.tables}), vehicle
+    return DiagnosisInput(manifest.run, {name: manifest.read(name) for name in manifest.tables}), vehicle
 
 
 def _diagnose(scenario: Scenario, folder: Path, **more: object) -> Diagnosis:

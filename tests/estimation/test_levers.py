@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.simulate import VEHICLES, Disturbance, Program, Scenario, simulate_run, write_log
 from pipeline.sources import find_preset
 
@@ -31,7 +31,7 @@ def test_a_lever_beside_a_cars_axle_is_told_on_both_axes(ahead: float, left: flo
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False)).manifest
     vehicle = find_preset(scene.vehicle.name)
     assert vehicle is not None
-    recording = Recording(manifest.run, {name: manifest.read(name) for name in manifest.tables})
+    recording = DiagnosisInput(manifest.run, {name: manifest.read(name) for name in manifest.tables})
     diagnosis = diagnose_runs([recording], vehicle, inputs=("command",))
     (lever,) = [one for one in diagnosis.runs[0].effects if one.id == "lever_arm"]
     assert lever.parameters["l_x"].value == pytest.approx(ahead, abs=0.05)

@@ -10,7 +10,7 @@ from few import few
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.results import RunDiagnosis
 from pipeline.simulate import (
     VEHICLES,
@@ -41,7 +41,7 @@ def _drive(program: str, effects: Mapping[str, object], folder: Path, vehicle: s
     preset = find_preset(VEHICLES[vehicle].name)
     assert preset is not None
     tables = {name: manifest.read(name) for name in manifest.tables}
-    return diagnose_runs([Recording(manifest.run, tables)], preset).runs[0]
+    return diagnose_runs([DiagnosisInput(manifest.run, tables)], preset).runs[0]
 
 
 @pytest.mark.parametrize("program", few(["straight", "spins"], 2))

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.simulate import VEHICLES, Disturbance, Scenario, simulate_run, write_log
 from pipeline.sources import find_preset
 from pipeline.words.diagnosis import describe
@@ -34,7 +34,7 @@ def test_a_pull_is_named_by_how_much_per_metre(effect: str, value: float, said: 
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False)).manifest
     vehicle = find_preset(scene.vehicle.name)
     assert vehicle is not None
-    recording = Recording(manifest.run, {name: manifest.read(name) for name in manifest.tables})
+    recording = DiagnosisInput(manifest.run, {name: manifest.read(name) for name in manifest.tables})
     diagnosis = diagnose_runs([recording], vehicle)
     (named,) = [one for one in diagnosis.runs[0].effects if one.id == effect]
     assert named.parameters["c"].value == pytest.approx(value, rel=0.05)

@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 from verbs import run_verb
 
-from pipeline.estimation import Recording
+from pipeline.estimation import DiagnosisInput
 from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.together import Member, judge_together
 from pipeline.results import RunDiagnosis
@@ -22,7 +22,7 @@ from pipeline.sources import find_preset
 from pipeline.words import format_finding
 
 
-def _draw(name: str, gain: float, *findings: tuple[str, float | None]) -> Recording:
+def _draw(name: str, gain: float, *findings: tuple[str, float | None]) -> DiagnosisInput:
     """A run whose body covers a share of the distance of its wheels."""
     times = np.arange(0.0, 20.0, 0.1)
     still = np.zeros(times.size)
@@ -57,7 +57,7 @@ def _draw(name: str, gain: float, *findings: tuple[str, float | None]) -> Record
         "alignments": pl.DataFrame([{**alignment, "gyro_scale": None}]),
         **({"findings": pl.DataFrame(found)} if found else {}),
     }
-    return Recording(name, tables)
+    return DiagnosisInput(name, tables)
 
 
 def _judge(members: Sequence[Member]) -> Diagnosis:

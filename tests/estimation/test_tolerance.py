@@ -12,7 +12,7 @@ from motion_runs import simulate, vehicle_of
 from verbs import ask_verb, print_verb, run_verb
 
 from pipeline.estimation.run_residuals import Input
-from pipeline.estimation.tolerance import Answer, Samples, find_speed_limit, gather_samples, limit_speeds
+from pipeline.estimation.tolerance import Answer, ErrorSamples, find_speed_limit, gather_samples, limit_speeds
 from pipeline.models import Model, ModelFile, find_effect
 from pipeline.run import MotionError
 from pipeline.simulate import Disturbance, simulate_case
@@ -23,11 +23,11 @@ QUANTILE = math.sqrt(-2.0 * math.log(0.05))
 """95 % quantile of the length of a vector of two standard normal numbers (Rayleigh)."""
 
 
-def draw(std: object, *, count: int = 1500, seed: int = 1) -> Samples:
+def draw(std: object, *, count: int = 1500, seed: int = 1) -> ErrorSamples:
     rng = np.random.default_rng(seed)
     speed = np.repeat(rng.uniform(0.2, 2.0, count // 5), 5) * rng.uniform(0.95, 1.05, count)
     x, y = rng.standard_normal((2, count)) * std(speed)  # type: ignore[operator]
-    return Samples(speed, np.hypot(x, y), np.arange(count) // 5)
+    return ErrorSamples(speed, np.hypot(x, y), np.arange(count) // 5)
 
 
 @pytest.mark.parametrize(

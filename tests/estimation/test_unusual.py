@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.estimation.plausibility import is_nameable, is_possible
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
@@ -43,7 +43,7 @@ def test_a_value_beyond_what_was_seen_is_named_and_called_unusual(
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False)).manifest
     vehicle = find_preset(scene.vehicle.name)
     assert vehicle is not None
-    recording = Recording(manifest.run, {name: manifest.read(name) for name in manifest.tables})
+    recording = DiagnosisInput(manifest.run, {name: manifest.read(name) for name in manifest.tables})
     (run,) = diagnose_runs([recording], vehicle, inputs=("measured",)).runs
     named = {one.id: one for one in run.effects}
     assert named[effect].parameters[number].value == pytest.approx(value, rel=0.05)

@@ -292,6 +292,7 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
                 "results",
                 "--file",
                 "out/x.mcap",
+                "--force",
             ],
             ["batch", "log.mcap", "--executor", "inline", "--settle", "0", "--results", "results"],
             ["analyze", "log.mcap", *analyze, "--results", "results"],

@@ -59,11 +59,23 @@ WORDS: list[tuple[str, str]] = [
     ("export missing --to csv", "missing"),
     ("serve missing --memory much", "'much' is not a size"),
     ("effects nothing", "no effect is called 'nothing'"),
+    # Files that are there already
+    ("simulate", r"run\.mcap: the file already exists\. Give --force to replace it, or another name\."),
+    ("simulate --file field/wide.mcap", "field/wide.mcap: the file already exists"),
+    ("simulate husky_tile --file planned", "planned/husky_tile.mcap: the file already exists"),
+    ("plan --vehicle husky_a200 --folder planned", "planned/plan.csv: the file already exists"),
+    ("diagnose field/wide --apply husky.toml", "husky.toml: the file already exists"),
+    ("export field/wide --to mcap --file field/wide.mcap", "field/wide.mcap: the file already exists"),
+    ("export field/wide --to csv --file planned", "planned/slip.csv: the file already exists"),
+    ("export field/wide --to foxglove-layout --file robot.json", "robot.json: the file already exists"),
+    ("check husky.toml field/wide --to junit --file husky.toml", "husky.toml: the file already exists"),
+    ("model export husky.toml --to json --file robot.json", "robot.json: the file already exists"),
+    ("model new-effect dangling.py", r"dangling\.py: the file already exists"),
     # Models
     ("model show field/wide.mcap", "this is not a model file: it is not text"),
     ("model show folder", "folder: this is not a model file: it is a folder"),
     ("model show missing.toml", "missing.toml"),
-    ("model new husky.toml --vehicle husky_a200", "--force"),
+    ("model new husky.toml --vehicle husky_a200", "husky.toml: the file already exists"),
     ("model new mine.toml --vehicle hunky", "hunky"),
     ("model new mine.toml --vehicle husky_a200 --from nobody", "nobody"),
     ("model new-effect wind.toml", r"side_wind\.py"),
@@ -115,7 +127,7 @@ WORDS: list[tuple[str, str]] = [
     ("check field/wide husky.toml", "husky.toml: AFTER is a model file, and not what was driven"),
     ("check '' field/wide", "the check has no runs BEFORE"),
     ("check husky.toml ''", "the check has no runs AFTER"),
-    ("check husky.toml field/wide --file check.md", "Add --to markdown or --to junit"),
+    ("check husky.toml field/wide --file check.md", "Add --to markdown, junit or html"),
     ("check folder folder", "there is no recording in it. Recordings are files that end in .mcap"),
     ("compare text.mcap", "this is not a results folder. Give the folder"),
     ("compare folder", "this is not a results folder. Give the folder"),
@@ -270,6 +282,10 @@ def folder(stored_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "bad.toml").write_text("[model\n")
     (folder / "folder").mkdir()
     (folder / "folder" / "husky.txt").touch()
+    (folder / "planned").mkdir()
+    for name in ("run.mcap", "planned/husky_tile.mcap", "planned/plan.csv", "planned/slip.csv"):
+        (folder / name).touch()
+    (folder / "dangling.py").symlink_to("nowhere")
     (folder / "robot.json").write_text('{"format": 1}')
     for name, vehicle in (("jackal", "jackal"), ("car", "ackermann_car")):
         assert run_verb("model", "new", folder / f"{name}.toml", "--vehicle", vehicle).returncode == 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from real_recordings import CASES, INERTIA, TRACK, C, Case, M, Recordings, make_model, measure
 
-from pipeline.estimation import EstimationData, carry_over, climb, fit_model
+from pipeline.estimation import EstimationData, carry_over, climb, estimate_intervals, fit_model
 from pipeline.estimation.ladder import compare_losses
 from pipeline.models import Model, find_effect
 from pipeline.results.reading import CHANCE, list_rises
@@ -108,3 +108,16 @@ def test_a_model_of_one_asphalt_predicts_another_but_not_ice(recordings: Recordi
     assert asphalt.warning == ""
     assert ice.ratio > 1.1
     assert "does not transfer" in ice.warning
+
+
+def test_a_fit_ends_at_the_same_values_far_from_them(recordings: Recordings) -> None:
+    run, vehicle = recordings.load("warthog_gravel_1")
+    # A late heading trades with skid: between far values of it the cost is less curved than steps expect.
+    effects = ("contact_friction", "lateral_skid", "heading_skew")
+    data = EstimationData([run], vehicle, C)
+    first = fit_model(data, make_model(vehicle, effects), exact=True)
+    for late in (0.001, 0.12):
+        again = fit_model(data, first.model.change("heading_skew", d=late), exact=True)
+        ends = {item.free.label: item.value for item in estimate_intervals(again).items}
+        for item in estimate_intervals(first).items:
+            assert abs(ends[item.free.label] - item.value) < 0.3 * item.half, (late, item.free.label)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import EstimationData, Input, fit_model
-from pipeline.models import Model, find_effect
+from pipeline.models import Model, find_effect, predict_step
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import JointDrive
 from pipeline.run.heading import Grid, average_held
@@ -189,3 +189,18 @@ def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: floa
     most = int(np.argmax(size))
     # A jump stays as large, however small the step.
     assert max(measure(np.linspace(steps[most], steps[most + 1], 50))) < 0.2 * max(size) + 1e-6
+
+
+def test_its_sentence_is_what_the_whole_drive_makes_of_a_step() -> None:
+    vehicle = vehicle_of("husky_a200")
+    servo = find_effect("wheel_servo")(**SERVO)
+    alone = servo.list_seen(vehicle)
+    beside = (find_effect("drive_lag")(tau=0.3), find_effect("transport_delay")(d=0.2), servo)
+    seen = servo.list_seen(vehicle, beside)
+    step = predict_step(vehicle, beside, seen["asked"], 0.0, 5.0).x / seen["asked"]
+    risen = STEP * (1 + np.flatnonzero(step >= 1.0 - np.exp(-1.0))[0])
+    assert seen["rise"] == pytest.approx(risen)
+    assert seen["rise"] > alone["rise"] + 0.2
+    turned = predict_step(vehicle, beside, 0.0, seen["turn"], 2.0).w[-1] / seen["turn"]
+    assert seen["turned"] == pytest.approx(turned)
+    assert 0.0 < seen["turned"] < alone["turned"]

@@ -1,5 +1,6 @@
 """A vehicle that the log does not name is a guess: what names it first, how wide and where not used."""
 
+import os
 import re
 import tomllib
 from dataclasses import replace
@@ -12,7 +13,7 @@ from drawn_drives import DrawnDrive, record_cdr, record_twist, stamp_ros, write_
 from drawn_motion import GAIN, RADIUS, TRACK, draw
 
 from pipeline.analysis import Options
-from pipeline.logs import open_log
+from pipeline.logs import list_files, open_log
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.motion import Steps, fit, measure_spread
@@ -104,6 +105,12 @@ def test_a_recording_without_its_end_takes_the_vehicle_of_its_folder(
 ) -> None:
     (tmp_path / named.name).write_bytes(named.read_bytes())
     (tmp_path / "cut.mcap").write_bytes(cut)
+    # What is no file is not opened: a pipe would wait for a writer.
+    os.mkfifo(tmp_path / "d_pipe.mcap")
+    (tmp_path / "b_link.mcap").symlink_to("d_pipe.mcap")
+    (tmp_path / "b_dead.mcap").symlink_to("nowhere.mcap")
+    (tmp_path / "b_device.mcap").symlink_to("/dev/zero")
+    assert list_files(tmp_path) == [tmp_path / named.name, tmp_path / "cut.mcap"]
     setup = set_up(tmp_path / "cut.mcap")
     assert (setup.vehicle.id, setup.choice.vehicle_source) == (BURGER, "folder")
     assert setup.choice.to_json({})["vehicle_source"] == "folder"

@@ -99,3 +99,35 @@ def test_a_base_that_skids_contradicts_nothing(pose: float, speeds: float, tmp_p
     drive = draw_drive(60.0)
     odometry = record_odometry(drive, "/wheel/odometry", "map", pose=pose, speeds=speeds)
     assert "its own speeds say" not in told(set_up(tmp_path, record_twist(drive), odometry))
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_speeds_that_are_differences_of_positions_are_those_of_the_way_that_is_gone(
+    every: int, tmp_path: Path
+) -> None:
+    """Of an odometry on a clock that jitters, or sent more often than its encoders are read."""
+    of = draw_drive(60.0)
+    turn = np.where(of.speed > 0.0, 0.8 * np.sign(np.sin(0.5 * of.time)), 0.0)
+    of = replace(of, turn=turn)
+    rng = np.random.default_rng(7)
+    jitter = 0.0 if every > 1 else rng.uniform(0.0, 0.9 * of.time[1], of.time.size)
+    speed, rate = follow(of.speed), follow(of.turn)
+    read = np.arange(of.time.size) // every * every
+    yaw = (np.cumsum(rate) * of.time[1])[read]
+    place = (np.cumsum(speed * np.exp(1j * np.cumsum(rate) * of.time[1])) * of.time[1])[read]
+    sent = replace(of, time=of.time + jitter)
+    elapsed = np.gradient(sent.time) if every > 1 else np.diff(sent.time, prepend=sent.time[0] - of.time[1])
+    moved = (np.diff(place, prepend=0.0) * np.exp(-1j * yaw)).real
+    fields: Mapping[str, Any] = {
+        **stamp_ros(sent),
+        **replace(sent, x=place.real, y=place.imag, yaw=yaw).pose("pose.pose."),
+        "header.frame_id": "odom",
+        "twist.twist.linear.x": moved / elapsed,
+        "twist.twist.angular.z": np.diff(yaw, prepend=0.0) / elapsed,
+    }
+    setup = set_up(tmp_path, record_twist(of), record_cdr(sent, "/odom", ODOMETRY, fields))
+    assert setup.choice.recording is not None
+    evidence = {one.name: one for one in setup.choice.recording.evidence}
+    for one in (evidence["/cmd_vel"], evidence["/odom"]):
+        assert one.ahead == pytest.approx(1.0, abs=0.02)
+        assert one.turned == pytest.approx(1.0, abs=0.02)

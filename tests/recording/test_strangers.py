@@ -326,6 +326,58 @@ def test_fixes_once_a_second_are_said_to_be_too_slow(tmp_path: Path) -> None:
         analyze_log(log, Options(out=tmp_path / "results", report=False, diagnosis=False))
 
 
+@pytest.mark.parametrize(
+    ("kind", "names", "per_degree", "number"),
+    [
+        ("SensorGps", ("latitude_deg", "longitude_deg", "altitude_msl_m"), 1.0, "float64"),
+        ("VehicleGpsPosition", ("lat", "lon", "alt"), 1e7, "int32"),
+    ],
+)
+def test_fixes_of_px4_are_read_in_each_of_its_layouts(
+    kind: str, names: tuple[str, str, str], per_degree: float, number: str, tmp_path: Path
+) -> None:
+    robot = Robot()
+    east, north = robot.does.x, robot.does.y
+    degrees = [47.0 + north / 111_200.0, 8.0 + east / 75_900.0, np.full(east.size, 0.4)]
+    values = [np.round(one * per_degree) if number == "int32" else one for one in degrees]
+    fields = dict(zip(names, (one.astype(number) for one in values), strict=True))
+    fields |= {"timestamp": robot.does.stamps // 1000, "fix_type": np.full(east.size, 6)}
+    fields["fix_type"][:50] = 1
+    layout = "\n".join(["uint64 timestamp", "uint8 fix_type", *(f"{number} {name}" for name in names)])
+    fixes = record_cdr(robot.does, "/fmu/out/vehicle_gps_position", f"px4_msgs/msg/{kind}", fields, layout)
+    setup = set_up(tmp_path, robot.command(), fixes)
+    assert str(setup.sources.pose) == "/fmu/out/vehicle_gps_position"
+    (asked,) = [one for one in setup.choice.recording.evidence if one.role == "command"]
+    assert asked.ahead == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_first_of_several_poses_in_a_frame_is_read(tmp_path: Path) -> None:
+    robot = Robot()
+    yaw = 0.5 * robot.does.yaw
+    other = {
+        "position": {"x": 5.0, "y": 5.0, "z": 0.0},
+        "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+    }
+    messages = [
+        {
+            "timestamp": {"sec": int(at // 10**9), "nsec": int(at % 10**9)},
+            "frame_id": "map",
+            "poses": [
+                {
+                    "position": {"x": float(x), "y": float(y), "z": 0.0},
+                    "orientation": {"x": 0.0, "y": 0.0, "z": np.sin(half), "w": np.cos(half)},
+                },
+                other,
+            ],
+        }
+        for at, x, y, half in zip(robot.does.stamps, robot.does.x, robot.does.y, yaw, strict=True)
+    ]
+    poses = record_json(robot.does, "/bodies", "foxglove.PosesInFrame", messages)
+    setup = set_up(tmp_path, robot.command(), robot.base(), poses)
+    assert str(setup.sources.pose) == "/bodies"
+    assert setup.choice.recording.is_followed
+
+
 def test_a_robot_that_is_pushed_is_not_said_to_stand(tmp_path: Path) -> None:
     robot = Robot()
     idle = record_twist(replace(robot.asked, speed=0.0 * robot.asked.speed, turn=0.0 * robot.asked.turn))

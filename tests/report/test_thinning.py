@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_synthesis import Floats, make_report
 
-from pipeline.report.figures.signal_figures import Signals, thin_to_ends, view_signals
+from pipeline.report.figures.signal_figures import break_holes, pack_signals, thin_to_ends, view_signals
 from pipeline.report.scene import (
     RunReport,
     Scene,
@@ -115,12 +115,18 @@ def test_packed_signals_keep_every_peak_and_a_long_run_takes_no_more_room() -> N
 
 
 def test_missing_values_of_a_signal_break_its_line() -> None:
-    gaps = Signals(
-        "imu", np.array([0.0, 0.1, 0.2, 5.0, 5.1]), {"a": np.array([1.0, np.nan, 2.0, 3.0, 1.0])}, {}
-    )
-    t, values = read_packed(gaps.pack(), "a")
-    np.testing.assert_allclose(t, gaps.t)
-    np.testing.assert_allclose(values, gaps.columns["a"], atol=1e-3)
-    assert gaps.list_rows("a")["value"].to_list() == [1.0, None, 2.0, None, 3.0, 1.0]
-    low_first = thin_to_ends(np.array([3.0, 1.0, 2.0, np.nan, np.nan, np.nan, 5.0]), 3)
-    np.testing.assert_array_equal(low_first, [3.0, 1.0, np.nan, np.nan, 5.0, 5.0])
+    gaps = pl.DataFrame({"t": [0.0, 0.1, 0.2, 5.0, 5.1], "a": [1.0, None, 2.0, 3.0, 1.0]})
+    t, values = read_packed(pack_signals(gaps), "a")
+    np.testing.assert_allclose(t, gaps["t"].to_numpy())
+    np.testing.assert_allclose(values, gaps["a"].to_numpy(), atol=1e-3)
+    drawn = break_holes(gaps.select("t", value="a"))
+    assert drawn["value"].to_list() == [1.0, None, 2.0, None, 3.0, 1.0]
+
+
+def test_of_a_group_of_rows_lowest_and_highest_remain_in_their_order() -> None:
+    values = [3.0, 1.0, 2.0, None, None, None, 5.0]
+    frame = pl.DataFrame({"t": np.arange(7.0), "a": values})
+    assert thin_to_ends(frame, 7).equals(frame)
+    thinned = thin_to_ends(frame, 5)
+    assert thinned["a"].to_list() == [3.0, 1.0, None, None, 5.0, 5.0]
+    assert thinned["t"].to_list() == [0.0, 1.0, 3.0, 4.0, 6.0, 6.0]

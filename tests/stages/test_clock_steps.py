@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from stage_logs import FIELD, Taken, TakeThrough, keep_good_rows, record
 
 from pipeline.analysis.work import as_recorded
-from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation import DiagnosisInput, diagnose_runs
 from pipeline.recording.clocks import Recorded, align_clocks
 from pipeline.run import Alignment, read_wheels
 from pipeline.simulate import Clock, Scenario
@@ -131,7 +131,7 @@ def find_effects(taken: Taken, tables: dict[str, pl.DataFrame]) -> tuple[set[str
     ).slip
     peaks["stages"] = tracemalloc.get_traced_memory()[1]
     tracemalloc.reset_peak()
-    (run,) = diagnose_runs([Recording("test", tables)], vehicle).runs
+    (run,) = diagnose_runs([DiagnosisInput("test", tables)], vehicle).runs
     peaks["diagnosis"] = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return {effect.id for effect in run.effects}, peaks

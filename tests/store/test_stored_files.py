@@ -22,7 +22,7 @@ VERBS = {
         f"diagnose {RUN}",
         f"diagnose {RUN} --all",
         f"results status {RUN}",
-        f"export {RUN} --to foxglove-layout --file x.json",
+        f"export {RUN} --to foxglove-layout --file x.json --force",
     ],
 }
 ODD = st.sampled_from([None, True, 0, -1.5, 1e300, "", "another", [], {}, [[]], {"a": None}, ["x"], [None]])

@@ -57,6 +57,13 @@ def test_a_verdict_says_what_a_suggested_term_would_leave() -> None:
     assert suggested.endswith("explains the rest: a suggested term would leave 5 cm and 1.1 degrees.")
 
 
+def test_where_no_stretch_is_long_enough_the_effect_is_said_and_no_error() -> None:
+    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(math.nan, math.nan), (math.nan, math.nan)])
+    verdict = format_verdict(drawn)
+    assert verdict.startswith("No stretch of good poses is long enough to tell an error. The robot")
+    assert "unknown amount" not in verdict
+
+
 def test_what_differs_between_grounds_is_a_range_in_the_verdict() -> None:
     drawn = draw_diagnosis({"effective_track": {"k": 1.5}}, [(1.0, 0.5), (0.05, 0.02)])
     (track,) = drawn.effects

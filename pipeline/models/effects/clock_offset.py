@@ -11,7 +11,7 @@ Source: header stamps against log times; measured on the DRIVE recordings.
 """
 
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Spread
-from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Reading
+from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Meaning
 from pipeline.run import RunContext, Velocity
 
 
@@ -38,9 +38,9 @@ class ClockOffset(ReportEffect):
     needs = (Excitation.CHANGES,)
     late = Late.POSES
     readings = (
-        Reading(Level.VEHICLE, "clock_offset", "a constant latency of the localization"),
-        Reading(Level.TERRAIN, "body_inertia", "inertia of the body on this terrain"),
-        Reading(Level.RUN, "clock_offset", "a clock that was reset"),
+        Meaning(Level.VEHICLE, "clock_offset", "a constant latency of the localization"),
+        Meaning(Level.TERRAIN, "body_inertia", "inertia of the body on this terrain"),
+        Meaning(Level.RUN, "clock_offset", "a clock that was reset"),
     )
 
     def report(self, velocity: Velocity, context: RunContext) -> Velocity:

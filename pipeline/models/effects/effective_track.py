@@ -12,10 +12,10 @@ from pipeline.models.families import (
     Excitation,
     Least,
     Level,
+    Meaning,
     Parameter,
     Plausible,
     Quantity,
-    Reading,
     Spread,
     declare,
 )
@@ -40,8 +40,8 @@ EffectiveTrack = declare(
     kinds=SIDES,
     needs=(Excitation.TURNING,),
     readings=(
-        Reading(Level.VEHICLE, "geometry", "a wrong track width"),
-        Reading(Level.TERRAIN, "effective_track", "skidding"),
-        Reading(Level.RUN, "effective_track", "a change of tyre pressure or load"),
+        Meaning(Level.VEHICLE, "geometry", "a wrong track width"),
+        Meaning(Level.TERRAIN, "effective_track", "skidding"),
+        Meaning(Level.RUN, "effective_track", "a change of tyre pressure or load"),
     ),
 )

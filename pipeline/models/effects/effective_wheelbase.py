@@ -11,10 +11,10 @@ from pipeline.models.families import (
     Excitation,
     Least,
     Level,
+    Meaning,
     Parameter,
     Plausible,
     Quantity,
-    Reading,
     declare,
 )
 
@@ -39,8 +39,8 @@ EffectiveWheelbase = declare(
     kinds=ACKERMANN,
     needs=(Excitation.STEERING,),
     readings=(
-        Reading(Level.VEHICLE, "geometry", "a wrong wheelbase"),
-        Reading(Level.TERRAIN, "effective_wheelbase", "deforming tyres"),
-        Reading(Level.RUN, "effective_wheelbase", "a change of tyre pressure or load"),
+        Meaning(Level.VEHICLE, "geometry", "a wrong wheelbase"),
+        Meaning(Level.TERRAIN, "effective_wheelbase", "deforming tyres"),
+        Meaning(Level.RUN, "effective_wheelbase", "a change of tyre pressure or load"),
     ),
 )

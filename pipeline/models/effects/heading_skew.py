@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
-from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Reading
+from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Meaning
 from pipeline.run import RunContext, Velocity, earlier_in_span
 
 
@@ -40,9 +40,9 @@ class HeadingSkew(ReportEffect):
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     late = Late.HEADING
     readings = (
-        Reading(Level.VEHICLE, "heading_skew", "a recorder that stamps headings late"),
-        Reading(Level.TERRAIN, "lateral_skid", "lateral skid on this terrain"),
-        Reading(Level.RUN, "heading_skew", "a clock that was reset"),
+        Meaning(Level.VEHICLE, "heading_skew", "a recorder that stamps headings late"),
+        Meaning(Level.TERRAIN, "lateral_skid", "lateral skid on this terrain"),
+        Meaning(Level.RUN, "heading_skew", "a clock that was reset"),
     )
 
     def report(self, velocity: Velocity, context: RunContext) -> Velocity:

@@ -9,10 +9,10 @@ from pipeline.models.families import (
     Excitation,
     Least,
     Level,
+    Meaning,
     Parameter,
     Plausible,
     Quantity,
-    Reading,
     Spread,
     declare,
 )
@@ -41,8 +41,8 @@ WheelRadius = declare(
     rank=30,
     needs=(Excitation.SPEED_SPREAD,),
     readings=(
-        Reading(Level.VEHICLE, "wheel_radius", "a wrong wheel radius"),
-        Reading(Level.TERRAIN, "longitudinal_slip", "longitudinal slip"),
-        Reading(Level.RUN, "wheel_radius", "a change of tyre pressure or load"),
+        Meaning(Level.VEHICLE, "wheel_radius", "a wrong wheel radius"),
+        Meaning(Level.TERRAIN, "longitudinal_slip", "longitudinal slip"),
+        Meaning(Level.RUN, "wheel_radius", "a change of tyre pressure or load"),
     ),
 )

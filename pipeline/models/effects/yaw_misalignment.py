@@ -6,7 +6,7 @@ backward; check the mounting of the sensor.
 Source: rotation of the reported frame; a crabbing vehicle moves alike.
 """
 
-from pipeline.models.families import Excitation, Least, Level, Parameter, Plausible, Reading, declare
+from pipeline.models.families import Excitation, Least, Level, Meaning, Parameter, Plausible, declare
 
 YawMisalignment = declare(
     "yaw_misalignment",
@@ -25,8 +25,8 @@ YawMisalignment = declare(
     rank=20,
     needs=(Excitation.BOTH_SIGNS,),
     readings=(
-        Reading(Level.VEHICLE, "yaw_misalignment", "a misaligned sensor or a bent axle"),
-        Reading(Level.TERRAIN, "crabbing", "crabbing on this terrain"),
-        Reading(Level.RUN, "yaw_misalignment", "a remounted sensor"),
+        Meaning(Level.VEHICLE, "yaw_misalignment", "a misaligned sensor or a bent axle"),
+        Meaning(Level.TERRAIN, "crabbing", "crabbing on this terrain"),
+        Meaning(Level.RUN, "yaw_misalignment", "a remounted sensor"),
     ),
 )

@@ -111,13 +111,24 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A position on Earth [deg], [m]; a status below zero is no fix, without a status each is one."""
+    """A position on Earth; a status below the least one is no fix, without a status each is one.
+
+    Attributes:
+        latitude, longitude: times `degrees`, in degrees.
+        altitude: times `metres`, in metres.
+        status: what kind of fix it is.
+        least: status of a fix.
+        frame: field with the name of the antenna's frame; empty if there is none.
+    """
 
     latitude: str
     longitude: str
     altitude: str
     status: str = ""
+    least: int = 0
     frame: str = "header.frame_id"
+    degrees: float = 1.0
+    metres: float = 1.0
 
 
 class GroundVelocityFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
