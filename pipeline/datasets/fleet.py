@@ -356,7 +356,7 @@ def decide_level(fit: Levels, pooled: Pooled, number: Parameter) -> tuple[Level 
 def _find_open(fit: Levels, pooled: Pooled) -> str:
     """Why terrain and run cannot be separated, and which runs would separate them; empty if they can."""
     if fit.counts.sum() == 1.0:
-        return "only one run determines it: more tell whether it is the vehicle's, the ground's or the run's"
+        return "only one run determines it: others are needed to find its level"
     if len(fit.names) == 1:
         only = f"only runs on {fit.names[0]} determine it"
         return f"{only}: runs on another terrain separate vehicle and terrain"

@@ -86,13 +86,13 @@ class Trend:
     @property
     def summary(self) -> str:
         """How many series could be tested, and how many have a step."""
-        tested = [one for one in self.series if one.step is not None]
-        if not tested:
+        testable = [one for one in self.series if one.step is not None]
+        if not testable:
             need = f"a series takes {FEWEST_OF_TEST} dated runs on terrains that were driven twice or more"
             return f"Nothing can be tested: {need}"
-        count = sum(one.is_changed for one in tested)
+        count = sum(one.is_changed for one in testable)
         steps = format_count(count, "significant step") if count else "No significant step"
-        return f"{steps} in the {len(tested)} of {len(self.series)} series that could be tested"
+        return f"{steps} in the {len(testable)} of {len(self.series)} series that could be tested"
 
     def to_json(self) -> dict[str, object]:
         """The JSON object of `slip fleet trend`."""

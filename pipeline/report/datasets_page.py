@@ -58,7 +58,7 @@ _MAP, _COMPLEXITY = (720, 520), (0.0, 10.0)
 """Width and height of the map [px], and the ends of the scale of terrains."""
 _RADIUS, _LETTER = {True: 7.5, False: 5.0}, {True: 7.0, False: 6.0}
 """Of own marks and of others: radius, and width of a letter beside them [px]."""
-_WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
 """Where a name may stand beside its mark, the best first."""
 _MOST_FIGURES = 40
 """Series of a page: those with a step come first."""
@@ -376,7 +376,7 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
         )
     )
     charts = [literature, *([marks] if drawn.own.height else [])]  # scales of no rows have no ends
-    names = _place_names(drawn, ends)
+    names = _position_names(drawn, ends)
     for is_own, weight in ((False, 400), (True, 600)):
         rows = Chart.of_rows("names").filter(f"datum.own == {str(is_own).lower()}")
         look = rows.mark("text", fontWeight=weight, **({} if is_own else {"color": theme.QUIET}))
@@ -391,7 +391,7 @@ def _draw_map(drawn: DeploymentMap, about: str) -> Picture:
     return Picture("deployment_map", "Energy and terrain", Drawing(chart, tables, note, words))
 
 
-def _place_names(drawn: DeploymentMap, ends: tuple[float, float]) -> pl.DataFrame:
+def _position_names(drawn: DeploymentMap, ends: tuple[float, float]) -> pl.DataFrame:
     """Names of marks where they cover neither a mark nor another name; those of own datasets come first.
 
     Args:
@@ -414,15 +414,15 @@ def _place_names(drawn: DeploymentMap, ends: tuple[float, float]) -> pl.DataFram
     for name, middle, is_own in marks:
         half = np.array([0.5 * _LETTER[is_own] * len(name), 7.0])
         free = list[tuple[float, int, Floats]]()
-        for step, way in itertools.product((1.0, 2.2), _WAYS):
-            place = middle + np.array(way) * (half + step * _RADIUS[is_own] + 2.0)
-            inside = bool((place - half >= 0.0).all() and (place + half <= np.array(_MAP)).all())
-            over = float(sum(bool((np.abs(place - at) < half + size).all()) for at, size in taken))
-            free.append((over if inside else math.inf, len(free), place))
-        covered, _, place = min(free, key=lambda one: one[:2])
+        for step, side in itertools.product((1.0, 2.2), _SIDES):
+            spot = middle + np.array(side) * (half + step * _RADIUS[is_own] + 2.0)
+            inside = bool((spot - half >= 0.0).all() and (spot + half <= np.array(_MAP)).all())
+            over = float(sum(bool((np.abs(spot - at) < half + size).all()) for at, size in taken))
+            free.append((over if inside else math.inf, len(free), spot))
+        covered, _, spot = min(free, key=lambda one: one[:2])
         if is_own or not covered:
-            taken.append((place, half))
-            x, y = (place / per_unit).tolist()
+            taken.append((spot, half))
+            x, y = (spot / per_unit).tolist()
             rows.append((x, ends[0] * math.exp(y), name, is_own))
     kinds = {"complexity": pl.Float64, "energy": pl.Float64, "name": pl.String, "own": pl.Boolean}
     return pl.DataFrame(rows, schema=kinds, orient="row")

@@ -59,7 +59,7 @@ def format_check(check: RunsCheck) -> str:
 
 def list_check_sentences(check: RunsCheck) -> list[str]:
     """The sentences of `format_check`, without capitals and periods."""
-    unknown = f"{_SPREAD_UNKNOWN}: {_say_what_tells(check)}"
+    unknown = f"{_SPREAD_UNKNOWN}: {_describe_missing_runs(check)}"
     changed, differs = check.list_status("changed"), check.list_status("differs")
     known = [one for one in check.numbers if one.is_known]
     sentences = _list_conditions(check)
@@ -115,17 +115,17 @@ def _list_conditions(check: RunsCheck) -> list[str]:
     return sentences
 
 
-def _say_what_tells(check: RunsCheck) -> str:
+def _describe_missing_runs(check: RunsCheck) -> str:
     """How many more runs, and where, tell how much runs differ without a change."""
     sides, grounds = check.sides, sorted({*check.sides.terrains[0], *check.sides.terrains[1]})
     where = f" on {' or '.join(grounds)}" if grounds else ""
     side = "AFTER" if sides.is_model else "BEFORE or AFTER"
-    told = (
+    needed = (
         f"{format_count(check.missing, 'more run')} {side}{where} {'tells' if check.missing == 1 else 'tell'}"
     )
     there = [f"{len(runs)} on {ground}" for ground, runs in sides.others.items()]
-    found = f"the results have {enumerate_texts(there) or 'none'}"
-    return told + (f", or {FEWEST_OF_SPREAD} other runs on one terrain ({found})" if grounds else "")
+    available = f"the results have {enumerate_texts(there) or 'none'}"
+    return needed + (f", or {FEWEST_OF_SPREAD} other runs on one terrain ({available})" if grounds else "")
 
 
 def _list(numbers: list[CheckedNumber]) -> str:

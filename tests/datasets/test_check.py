@@ -148,7 +148,7 @@ def test_what_its_interval_or_its_width_leaves_open_is_not_called_unchanged(same
         assert number.status == status
         found = RunsCheck(same, (number,))
         (row,) = (line for line in list_check_lines(found) if line[0] == status)
-        assert re.search(r"\] +0\.1 ", row[1]), "the p over all numbers stands beside the word"
+        assert re.search(r"\] +0\.1$", row[1]), "the p over all numbers stands beside the word"
     single = replace(blank, difference=0.5, low=0.08, high=1.04, smallest=0.2, **known)
     assert "Not shown beyond chance, but near: share of asked yaw rate 0.23 -> 0.35" in format_check(
         RunsCheck(same, (single,))

@@ -14,7 +14,7 @@ from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.datasets.deployments import draw_up_map
 from pipeline.datasets.trend import follow_trend
 from pipeline.report import lead_to
-from pipeline.report.datasets_page import _place_names, write_map, write_trend
+from pipeline.report.datasets_page import _position_names, write_map, write_trend
 from pipeline.store import Store, see_log
 
 
@@ -65,7 +65,7 @@ def test_names_on_the_map_cover_no_mark_and_no_other_name() -> None:
     )
     points = own.select(pl.lit("Someone2024").alias("key"), "complexity", pl.col("energy") * 1.01)
     drawn = SimpleNamespace(own=own, points=points)
-    names = _place_names(drawn, (10.0, 100_000.0))  # type: ignore[arg-type]
+    names = _position_names(drawn, (10.0, 100_000.0))  # type: ignore[arg-type]
     assert set(names.filter("own")["name"]) == set(own["dataset"]), "every own dataset has its name"
     assert "Someone2024" in set(names["name"])
 
