@@ -383,7 +383,7 @@ class WheelResiduals(PathResiduals):
     def list_free(self, state: ModelState, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
         """See `PathResiduals`; limits are at least what the measured wheels exceed.
 
-        A delay of the commands is that of the encoders, too: both are one number.
+        A delay of the commands and one of the encoders are one number here: only one of them is free.
         """
         free = super().list_free(state, per_run)
         return tuple(self._bound(state, one) for one in free if one.effect or not _has_dead_time(state))
@@ -415,7 +415,9 @@ class WheelResiduals(PathResiduals):
         """Velocities with the encoders later by ``late_s`` [s]."""
         run_residuals = self.residuals_by_run[run]
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        late_s += 0.0 if _has_dead_time(state) else state.timing[run].encoder_delay_s
+        timing = state.timing[run]
+        # By how much readings are late the ground tells; a dead time beyond it is that of the commands.
+        late_s += timing.wheel_delay_s if _has_dead_time(state) else timing.encoder_delay_s
         spans = self._spans[run] if late_s == 0.0 else locate_windows(run_residuals, late_s)
         driven = average_windows(run_residuals, run_residuals.predict_wheels(drive, _NO_DELAY), spans)
         apart: Floats = self._seen[run] - driven

@@ -12,7 +12,7 @@ from pipeline.estimation import EstimationData, Input, fit_model
 from pipeline.estimation.fit import fit_path, hold_out, make_folds
 from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.model_file import parse_model
-from pipeline.simulate import Disturbance, Program
+from pipeline.simulate import Disturbance, Encoders, Program
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": 1.7, "icr_offset": 0.1, "drive_lag": 0.3}
@@ -119,3 +119,11 @@ def test_each_ground_has_its_own_numbers_and_the_vehicle_one() -> None:
     alike = [replace(run, terrain="tile") for run in runs]
     shared = fit_model(EstimationData(alike, HUSKY, Input.MEASURED), model).state
     assert shared.effects_of(0) == shared.effects_of(1)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.06])
+def test_a_dead_time_is_that_of_the_commands_however_late_encoders_are(late_s: float) -> None:
+    run = simulate({"transport_delay": 0.25}, duration_s=120.0, encoders=Encoders(delay_s=late_s))
+    data = EstimationData([run], HUSKY, Input.COMMAND)
+    fitted = fit_model(data, Model(HUSKY, (find_effect("transport_delay")(),)), exact=True)
+    assert fitted.model.effect("transport_delay").delay == pytest.approx(0.25, abs=0.01)
