@@ -84,9 +84,9 @@ def check_lengths(by_tape: Sequence[Finding], choice: Choice) -> list[Finding]:
         taped = values.get("ahead") or values.get("wheel_radius_m")
         ratio = taped[0] / (known if values["kind"] == "sides" else 1.0) if isinstance(taped, list) else 1.0
         if not 1.0 / _FAR < ratio < _FAR:
-            said = {"kind": "contradicted", "source": values["source"], "vehicle": choice.vehicle.name}
-            said |= {"value": 1.0 / ratio} | ({"radius_m": known} if values["kind"] == "sides" else {})
-            checked.append(Finding("lengths_by_tape", "warning", "vehicle", said))
+            said = {"source": values["source"], "vehicle": choice.vehicle.name, "value": 1.0 / ratio}
+            said |= {"radius_m": known} if values["kind"] == "sides" else {}
+            checked.append(Finding("tape_contradicts_vehicle", "warning", "vehicle", said))
         else:
             checked.append(one)
     return checked

@@ -614,15 +614,17 @@ def _command_scaled(of: Values) -> str:
     return f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
 
 
+def _tape_contradicts(of: Values) -> str:
+    radius = f" and a wheel radius of {of['radius_m']:.4g} m" if "radius_m" in of else ""
+    return (
+        f"the distance that was measured by hand contradicts the {of['vehicle']}: by {of['source']}"
+        f"{radius} it drove {of['value']:.3g} times as far in this log. No length is taken from it: "
+        "measure all that the log holds, or record the measured drive alone"
+    )
+
+
 def _by_tape(of: Values) -> str:
     """Lengths by what was measured by hand, as lines of run.toml, or gains of a body's motion."""
-    if of["kind"] == "contradicted":
-        radius = f" and a wheel radius of {of['radius_m']:.4g} m" if "radius_m" in of else ""
-        return (
-            f"the distance that was measured by hand contradicts the {of['vehicle']}: by {of['source']}"
-            f"{radius} it drove {of['value']:.3g} times as far in this log. No length is taken from it: "
-            "measure all that the log holds, or record the measured drive alone"
-        )
     names = {"ahead": "drives", "turning": "turns"}
     texts = []
     for name in ("wheel_radius_m", "track_width_m", "ahead", "turning"):
@@ -1103,6 +1105,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         "of the drive and the ground are not known from them",
     },
     "lengths_by_tape": _by_tape,
+    "tape_contradicts_vehicle": _tape_contradicts,
     "poses_left_out": "{all} topics or frames hold poses: the {compared} with most messages were compared",
     "vehicle_choice": {"description": _preset_differs, "parameters": _controller_differs},
     "no_command": "the log contains no commands: it is analyzed from wheel encoders",

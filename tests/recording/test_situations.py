@@ -363,7 +363,7 @@ def test_a_tape_and_turns_tell_radius_and_track(
 def test_a_tape_that_contradicts_the_vehicle_offers_no_length(samples: Path, tmp_path: Path) -> None:
     options = Options(out=tmp_path, overrides={"truth": {"distance_m": 0.2, "turns": 3.0}})
     notes = inspect_log(samples / "husky_tile.mcap", options).notes
-    (found,) = [one for one in notes if one.id == "lengths_by_tape"]
+    (found,) = [one for one in notes if one.id == "tape_contradicts_vehicle"]
     assert "wheel_radius_m" not in found.values
     said = format_finding(found)
     assert re.search(r"contradicts the .*Husky.* times as far in this log\. No length is taken", said), said

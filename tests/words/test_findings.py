@@ -22,7 +22,9 @@ ROOT = Path(__file__).parents[2]
 OF_TABLES = {
     ("pipeline.stages.spans", "one.kind"): frozenset(spans._INCIDENTS),
     ("pipeline.stages.motion_events", "kind"): frozenset(motion_events._KINDS.values()),
-    ("pipeline.stages.checks", "name"): frozenset({find_late_effect(Late.HEADING).id}),
+    ("pipeline.stages.checks", "find_late_effect(Late.HEADING).id"): frozenset(
+        {find_late_effect(Late.HEADING).id}
+    ),
     ("pipeline.recording.clocks", "name"): frozenset({find_late_effect(Late.POSES).id}),
     ("pipeline.recording.case", "name"): frozenset(
         {"pose_turned", "imu_corrected", "wheels_corrected", "command_corrected"}
