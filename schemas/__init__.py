@@ -214,7 +214,7 @@ class Datasets(Table):
     median_modulus = optional("m/s", "median over runs of the runs' median slip modulus")
     low = optional("m/s", "lower end of the 95 % interval of the typical median slip modulus")
     high = optional("m/s", "upper end of it")
-    interval = text("what the interval is of: over runs; one run, with the spread of others; this run only; or empty")
+    interval = text("of what: over runs; one run, with the spread of others; this run only; or empty")
     equal_modulus = optional("m/s", "slip modulus at equal driving: mean of logarithms, weighed by run")
     equal_low = optional("m/s", "lower end of its 95 % interval over runs")
     equal_high = optional("m/s", "upper end of it")

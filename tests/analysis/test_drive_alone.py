@@ -24,7 +24,7 @@ from pipeline.logs.writer import LogWriter
 from pipeline.models import find_effect
 from pipeline.models.effect import Place
 from pipeline.run.signals import GROUND_UNOBSERVABLE
-from pipeline.simulate import DiagnosisInput, Encoders, Scenario, make_scenario, simulate_run, write_log
+from pipeline.simulate import Encoders, Recording, Scenario, make_scenario, simulate_run, write_log
 from pipeline.simulate.facts import find_layout
 from pipeline.simulate.messages import list_topics
 from pipeline.sources import find_preset
@@ -49,7 +49,7 @@ def make(
     encoders: Encoders | None = None,
 ) -> Scenario:
     scenario = make_scenario(None, effects, seed=3, duration_s=80.0, vehicle=vehicle)
-    recording = DiagnosisInput(layout, deployment="written" if is_named else "absent")
+    recording = Recording(layout, deployment="written" if is_named else "absent")
     return replace(scenario, recording=recording, encoders=encoders or scenario.encoders)
 
 

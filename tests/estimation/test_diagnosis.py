@@ -44,7 +44,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate import (
-    DiagnosisInput as Recorded,
+    Recording as Recorded,
 )
 from pipeline.sources import Vehicle, find_preset
 from pipeline.words.diagnosis import describe, list_lines
