@@ -109,7 +109,14 @@ def _start_processes(work: Callable[[Task], Report], limits: Limits, jobs: int) 
     start = concurrent.process(timeout=limits.timeout_s + _GRACE_S, **contexts)(_run_alone)
     # Nobody writes to it: it closes with this process, however that ends.
     line, end = server.Pipe(duplex=False)
-    return Executor(lambda task: start(work, task, limits, line), end.close, depth=jobs)
+
+    def submit(task: Task) -> Any:  # noqa: ANN401 - as `Executor.submit`
+        future = start(work, task, limits, line)
+        # It stays open as long as anybody waits for a report, whether or not they hold the executor.
+        future.add_done_callback(lambda _: end)
+        return future
+
+    return Executor(submit, end.close, depth=jobs)
 
 
 def _run_alone(

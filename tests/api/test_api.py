@@ -110,7 +110,7 @@ def test_a_fit_is_that_of_the_command_line(
 
     content = json.loads(json.dumps(fit.to_json()))
     assert content == {key: told[key] for key in content}
-    assert set(told) - set(content) == {"model", "prior", "carried_over", "warnings"}
+    assert set(told) - set(content) == {"model", "carried_over", "warnings"}
     assert fit.errors == told["by_run"][run.name]
     assert slip.Model.read(path).parameters.equals(fit.model.parameters)
     fit.model.write(tmp_path / "again.toml")
