@@ -63,7 +63,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class LossDifference:
-    """LossDifference of two errors, with its 95 % interval."""
+    """Difference of two errors, with its 95 % interval."""
 
     value: float
     low: float
@@ -92,7 +92,7 @@ class Contest:
         return min(self.rivals, key=lambda rival: (math.isnan(rival.read(metric)), rival.read(metric)))
 
     def measure(self, rival: Rival, other: Rival, metric: str) -> LossDifference:
-        """LossDifference of the errors of a model and of another one."""
+        """Difference of the errors of a model and of another one."""
         return compare_errors(rival.list_errors(metric), other.list_errors(metric), self.stretches)
 
     def list_ties(self, metric: str) -> list[Rival]:
@@ -132,7 +132,7 @@ def hold_contest(data: EstimationData, rivals: Sequence[Rival]) -> Contest:
 
 
 def compare_errors(one: Floats, other: Floats, stretches: Ints) -> LossDifference:
-    """LossDifference of two root mean squares over the same predictions, by a jackknife over stretches.
+    """Difference of two root mean squares over the same predictions, by a jackknife over stretches.
 
     Args:
         one: errors, shape (n,); NaN without a prediction.

@@ -117,7 +117,7 @@ def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
 
 
 def fit(values: Floats, columns: Floats, steps: Steps) -> MotionFit:
-    """MotionFit a channel of the motion by columns.
+    """Fit a channel of the motion by columns.
 
     Args:
         values: increments, shape (n,).

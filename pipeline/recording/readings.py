@@ -335,7 +335,7 @@ class Reading:
         return replace(self, explained=self.explain(whole))
 
     def explain(self, whole: Motion) -> Explained:
-        """MotionFit the motion; `UNEXPLAINED` where too little is recorded."""
+        """Fit the motion; `UNEXPLAINED` where too little is recorded."""
         if not (whole.is_known and self.inputs):
             return UNEXPLAINED
         keep = np.logical_and.reduce([one.is_there(whole.steps) for one in self.inputs])
@@ -370,7 +370,7 @@ class Reading:
         return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
 
     def fit_to(self, motion: Motion, delays: Floats, *, crossed: bool) -> Explained:
-        """MotionFit all of a motion.
+        """Fit all of a motion.
 
         Args:
             motion: where the reading is recorded.
@@ -477,7 +477,7 @@ def stack(values: Complex) -> Floats:
 
 
 def fit_across(motion: Motion, columns: Sequence[Complex], *, lever: bool) -> MotionFit:
-    """MotionFit the motion in the plane, both directions alike.
+    """Fit the motion in the plane, both directions alike.
 
     Args:
         motion: of the body.
