@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import STRETCH_S, Flags, Floats, Ints, arrays, guarded_spread, robust_spread
+from pipeline.core import (
+    STRETCH_S,
+    Flags,
+    Floats,
+    Ints,
+    arrays,
+    fit_robustly,
+    guarded_spread,
+    robust_spread,
+    weigh_bounded,
+)
 from pipeline.estimation.model_state import ModelState
 from pipeline.models import Timing
 from pipeline.run import NODE_S, SPAN_S, average_spans
@@ -25,7 +35,9 @@ if TYPE_CHECKING:
 CLIP = 6.0
 """Limit at which residuals are clipped [robust standard deviations]: six do not affect normal noise."""
 _RIDGE = 1e-6
-"""Regularization of normal equations for columns of unit size."""
+"""See `fit_robustly`: some regressors are nearly others."""
+_ROUNDS = 3
+"""Reweightings of the regression on a residual's past."""
 _LEAST_SPREAD = 2e-4
 """Least spread of a displacement [m, rad] over half a second: rounding of stamps."""
 _STANDING = 0.02
@@ -125,16 +137,10 @@ class WindowResiduals:
 
 def regress_robustly(columns: Floats, values: Floats) -> Floats:
     """Residuals (n,) of a regression on columns (n, p), outliers weighted down, widened for its freedom."""
-    columns = columns[:, columns.std(axis=0) > 0.0]
-    size = np.sqrt((columns**2).mean(axis=0))
-    columns = np.column_stack((columns / size, np.ones(columns.shape[0])))
-    weight, rest = np.ones(values.size), values
-    ridge = _RIDGE * values.size * np.eye(columns.shape[1])
-    for _ in range(3):
-        weighted = columns * weight[:, None]
-        rest = values - columns @ np.linalg.solve(weighted.T @ columns + ridge, weighted.T @ values)
-        spread = robust_spread(rest) + 1e-12
-        weight = np.minimum(1.0, 3.0 * spread / np.maximum(np.abs(rest), 1e-12))
+    columns = np.column_stack((columns[:, columns.std(axis=0) > 0.0], np.ones(columns.shape[0])))
+    rest = fit_robustly(
+        columns, values, measure=robust_spread, weigh=weigh_bounded, ridge=_RIDGE, rounds=_ROUNDS
+    ).rest
     freedom = max(values.size - columns.shape[1], 0.25 * values.size)
     widened: Floats = rest * np.sqrt(values.size / freedom)
     return widened
