@@ -168,6 +168,9 @@ def hold_lock(path: Path, *, patience_s: float) -> Iterator[None]:
             path.write_text(f"process {os.getpid()} on {platform.node()} (since {since})", encoding="utf-8")
         yield
     finally:
+        # Nobody holds it then, and a run's folder does not hang on who made it, and when.
+        with suppress(OSError):
+            path.write_bytes(b"")
         lock.release()
 
 

@@ -320,3 +320,5 @@ def test_the_file_stays_and_a_thread_other_than_the_one_that_locked_may_let_go(t
     with hold_lock(path, patience_s=0.0):
         assert path.stat().st_ino == inode
         assert f"process {os.getpid()} on" in path.read_text()
+    # It says who holds it, and nothing when nobody does: folders of equal runs are equal.
+    assert path.read_bytes() == b""
