@@ -21,7 +21,9 @@ from pipeline.core import (
     PACKAGE,
     FigureFormat,
     SlipError,
+    enumerate_texts,
     mapping_in,
+    name_first,
     read_version,
     require_compiler,
     require_package,
@@ -63,12 +65,15 @@ class Outcome:
         manifest: the current generation.
         computed: stages that were computed; empty when nothing had changed.
         twin: another log of the same content, whose run this one shares; empty if there is none.
+        replaced: what the earlier results of the run were made with, where that was something else, and where
+            they are kept; empty if no other answer was replaced.
     """
 
     summary: Mapping[str, JSON]
     manifest: Manifest
     computed: tuple[str, ...]
     twin: str = ""
+    replaced: str = ""
 
     @property
     def lossy(self) -> bool:
@@ -131,7 +136,57 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
             verdict = judge_run(generation.read_table("findings"), diagnosis)
             _write_outputs(work, log, options, progress, diagnosis, verdict)
         manifest = generation.commit({**_details(work, log, sha256), "verdict": verdict})
-    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin)
+    replaced = "" if previous is None else _describe_replaced(previous, manifest)
+    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin, replaced)
+
+
+def _describe_replaced(before: Manifest, now: Manifest) -> str:
+    """What made the earlier results others than those that replace them, and where they are kept."""
+    differing = _list_changes(*map(_list_choices, (before, now)))
+    made = [f"made with {differing}"] if differing else []
+    parts = {"diagnosis": DIAGNOSIS, "report": REPORT, "summary": SUMMARY}
+    lost = [name for name, file in parts.items() if file in before.files and file not in now.files]
+    made += [f"with a {enumerate_texts(lost)}, which the new ones lack"] if lost else []
+    where = spell_location(before.folder)
+    return f"{'; '.join(made)}; they are kept in {where} until slip batch --prune" if made else ""
+
+
+def _list_choices(manifest: Manifest) -> dict[str, object]:
+    """What was chosen for the results of a run."""
+    keys = ("configuration", "inputs", "vehicle", "terrain", "dataset")
+    model = stored_contexts(manifest).get("slip", {}).get("model")
+    return {"model": model, **{key: manifest.details.get(key) for key in keys}}
+
+
+def _list_changes(before: Mapping[str, object], now: Mapping[str, object]) -> str:
+    """Choices that differ, as run.toml spells them: ``use_intervals = recorded (now all)``; or empty.
+
+    What follows from the choices, as a vehicle from its preset, is named where no choice differs.
+    """
+    chosen = ("configuration", "inputs", "model")
+    for keys in (chosen, [key for key in now if key not in chosen]):
+        was, is_now = (_flatten({key: each.get(key) for key in keys}) for each in (before, now))
+        names = [name for name in {**was, **is_now} if was.get(name) != is_now.get(name)]
+        if names:
+            return name_first(
+                [f"{one} = {_spell(was.get(one))} (now {_spell(is_now.get(one))})" for one in names]
+            )
+    return ""
+
+
+def _flatten(content: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Values by dotted names, without the name of the whole configuration."""
+    flat: dict[str, object] = {}
+    for key, value in content.items():
+        name = "" if key == "configuration" else f"{prefix}{key}"
+        flat |= _flatten(value, f"{name}." if name else "") if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def _spell(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return " and ".join(map(_spell, value)) or "none"
+    return "not set" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
 def _ask_as_before(options: Options, damaged: Manifest) -> Options:
@@ -359,17 +414,14 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
             update_datasets(store)
         yield OpenedRun(outcome.manifest, outcome.lossy)
         return
-    changed = _is_changed(path, stored, options, asked=chosen)
+    changed = _find_changes(path, stored, options, asked=chosen)
     if changed and chosen:
         with tempfile.TemporaryDirectory(prefix="slip-") as folder:
             aside = replace(options, out=Path(folder), run=stored.run, report=False, diagnosis=False)
             outcome = analyze_log(path, aside, progress)
             yield OpenedRun(outcome.manifest, outcome.lossy)
         return
-    note = (
-        f"{stored.run} is read as it was analyzed, with other options or another configuration than now; "
-        f"slip analyze {text} recomputes it"
-    )
+    note = f"{stored.run} is read as it was analyzed, with {changed}; slip analyze {text} recomputes it"
     lossy = bool(stored_contexts(stored).get("extract", {}).get("losses"))
     yield OpenedRun(stored, lossy, note if changed else "")
 
@@ -397,15 +449,15 @@ def _find_named(text: str, path: Path, store: Store) -> Manifest | None:
     return None if path.suffix else find_run(text, store)
 
 
-def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:
-    """Whether an analysis would now use another vehicle or configuration."""
+def _find_changes(path: Path, stored: Manifest, options: Options, *, asked: bool) -> str:
+    """What an analysis would now use another of: vehicle or configuration; empty if nothing changed."""
     try:
         setup = set_up_log(path, options)
     except SlipError:
         if asked:
             raise
         # Without the options of its analysis, the log alone may be insufficient.
-        return False
+        return ""
     now = {
         "configuration": msgspec.to_builtins(setup.configuration),
         "vehicle": msgspec.to_builtins(setup.vehicle),
@@ -413,4 +465,4 @@ def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) 
         "dataset": setup.dataset,
         "inputs": options.inputs,
     }
-    return any(stored.details.get(key) != value for key, value in json.loads(json.dumps(now)).items())
+    return _list_changes(stored.details, json.loads(json.dumps(now)))

@@ -225,6 +225,7 @@ class Status:
 
     Attributes:
         runs: runs with results.
+        writers: who writes which run now, by the folder of the run.
         entries: batch outcome of each log, sorted by path; without logs that gave no results and no longer
             exist.
         counts: logs by state, each of `LOG_STATES`.
@@ -235,6 +236,7 @@ class Status:
     """
 
     runs: int
+    writers: Mapping[str, str]
     entries: tuple[Entry, ...]
     counts: Mapping[str, int]
     bytes: int
@@ -247,16 +249,18 @@ def read_status(store: Store) -> Status:
     """Read the status from the results and the ledger."""
     survey = store.survey()
     known = Ledger(store).read_all()
-    noted = [note for note in list_noted(store) if note["path"] in known]
+    noted = list_noted(store)
     entries = tuple(
         replace(known[note["path"]], state=note["state"], reason=note["reason"], hint=note["hint"])
         for note in noted
+        if note["path"] in known
     )
     size, unread = measure_results(store)
     return Status(
         runs=len(survey.manifests),
+        writers=store.list_writers(),
         entries=entries,
-        counts=count_logs(store),
+        counts=count_logs(noted),
         bytes=size,
         old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),

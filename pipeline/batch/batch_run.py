@@ -58,6 +58,7 @@ class Line:
         peak_bytes: peak memory of its worker.
         size_bytes: size of the log.
         waited_for: who was working on it before; empty without anybody.
+        replaced: what its earlier results were made with and where they are kept, if they were others.
     """
 
     path: str
@@ -72,6 +73,7 @@ class Line:
     peak_bytes: int = 0
     size_bytes: int = 0
     waited_for: str = ""
+    replaced: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +142,7 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
             waited[path] = report.holder
             return
         line = _make_line(report.entry, is_new=report.is_new)
-        lines.append(replace(line, waited_for=waited.get(path, "")))
+        lines.append(replace(line, waited_for=waited.get(path, ""), replaced=report.replaced))
         watch.notify(lines[-1], report.entry.log.size)
 
     remaining = _work_through(todo, request, work, note)

@@ -21,7 +21,7 @@ from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Sto
 # A ledger entry counts only if the results confirm it: a log is done only while the results contain the
 # generation named in its entry. A lost entry costs one reading of the log.
 
-STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "not_started", "left_out")
+STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "not_started")
 """What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
@@ -135,11 +135,13 @@ class Report:
     Attributes:
         entry: new ledger entry of the log.
         is_new: whether a generation was published; false if nothing had changed.
+        replaced: what the earlier results that it replaced were made with, where that was something else.
         holder: who is working on the same run, so that nothing was done; empty where nobody is.
     """
 
     entry: Entry
     is_new: bool = False
+    replaced: str = ""
     holder: str = ""
 
 
@@ -166,12 +168,12 @@ def work_on(task: Task) -> Report:
     store = Store(task.options.out)
     started = time.monotonic()
     entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.run)
-    is_new = False
+    is_new, replaced = False, ""
     try:
         with store.claim(entry.run) as holder:
             if holder:
                 return Report(entry=entry, holder=holder)
-            entry, is_new = _analyze(task, entry)
+            entry, is_new, replaced = _analyze(task, entry)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
@@ -183,10 +185,10 @@ def work_on(task: Task) -> Report:
         peak_bytes=_peak_bytes(),
     )
     Ledger(store).write(entry)
-    return Report(entry=entry, is_new=is_new)
+    return Report(entry=entry, is_new=is_new, replaced=replaced)
 
 
-def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool]:
+def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str]:
     before = Store(task.options.out).manifest(entry.run) if entry.run else None
     try:
         outcome = analyze_log(task.path, task.options)
@@ -204,7 +206,7 @@ def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool]:
         hint=f"List what the log holds: slip inspect {task.path}" if outcome.refusal else "",
         has_report=REPORT in outcome.manifest.files,
     )
-    return done, before is None or before.folder != outcome.manifest.folder
+    return done, before is None or before.folder != outcome.manifest.folder, outcome.replaced
 
 
 def _format_losses(outcome: Outcome) -> str:

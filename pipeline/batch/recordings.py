@@ -4,10 +4,8 @@ import errno
 import fnmatch
 import os
 import re
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from pipeline.batch import BatchError
-from pipeline.core import walk_tree
+from pipeline.core import ask_within, describe_silence, walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 from pipeline.logs.index import LISTING, are_separate, split_number
 
@@ -67,21 +65,10 @@ class Looker:
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
         """Result of a query about a path; None, with a note in `skipped`, if there is none."""
-        answer: Future[Answer] = Future()
-
-        def work() -> None:
-            try:
-                answer.set_result(question())
-            except Exception as error:  # noqa: BLE001 - it is raised where it was asked
-                answer.set_exception(error)
-
-        # A thread that can be abandoned: a call to a dead mount does not return.
-        threading.Thread(target=work, name="folders", daemon=True).start()
         try:
-            return answer.result(self.patience_s)
+            return ask_within(question, self.patience_s)
         except TimeoutError:
-            why = f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
-            self.skip(path, why)
+            self.skip(path, describe_silence(self.patience_s))
         except OSError as error:
             self.skip(path, f"it cannot be read ({error.strerror or error})")
         return None

@@ -133,7 +133,13 @@ _SHOWN = 6
 
 
 def format_run(
-    summary: Summary, *, unchanged: bool, twin: str = "", said: str = "", everything: bool = False
+    summary: Summary,
+    *,
+    unchanged: bool,
+    twin: str = "",
+    replaced: str = "",
+    said: str = "",
+    everything: bool = False,
 ) -> str:
     """The summary of one run as lines of text: the verdict, the effects, what remains and what to do.
 
@@ -141,6 +147,7 @@ def format_run(
         summary: the JSON object of the run.
         unchanged: whether nothing was computed.
         twin: a log of the same content that it shares.
+        replaced: what the earlier results that this run replaces were made with, and where they are.
         said: what was chosen on the command line, to be said again by the next command.
         everything: whether more is shown than what everybody reads.
     """
@@ -160,6 +167,7 @@ def format_run(
         *_format_diagnosis(summary, everything=everything),
         *(_row(*row) for row in words.list_findings({"": every}, verdict, everything=everything)),
         *([_row("same", f"content as {twin}: counted once, under that name")] if twin else []),
+        *([_row("replaced", f"earlier results, {replaced}")] if replaced else []),
         *_format_end(summary, said, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"

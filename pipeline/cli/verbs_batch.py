@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from pipeline.batch.batch_run import Outcome
 
 _MEMORY_SHARE = 0.8
+_MOST_REPLACED = 3
+"""Logs whose earlier results were replaced that are named: with another option these are all of a season."""
 
 
 def batch(  # noqa: D417 - the shared choices document themselves
@@ -166,11 +168,20 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 
 
 def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
-    """The closing table: how many logs came out how, and of those that need a look, why."""
+    """The closing table: how many logs came out how, and of those that need a look, why.
+
+    Results that were made with other options are said to be replaced.
+    """
     lines = format_counts(outcome.counts, width=6)
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     for state in (*EXPLAINED, "copy"):
         own = [(line.path, line.reason, line.hint) for line in outcome.lines if line.state == state]
         lines += explain_logs(name_state(state), own)
+    replaced = [
+        (line.path, f"earlier results, {line.replaced}", "") for line in outcome.lines if line.replaced
+    ]
+    lines += explain_logs("replaced", replaced[:_MOST_REPLACED])
+    more = len(replaced) - _MOST_REPLACED
+    lines += [f"  and {more} more (--json lists them)"] if more > 0 else []
     return lines

@@ -99,7 +99,10 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     options = replace(build_options(choices), report=report, diagnosis=diagnosis, figures=figures)
     options = replace(options, force=force, model=model)
     outcomes: list[Outcome] = []
-    asked.list_runs = lambda: [{**one.summary, "same_content_as": one.twin or None} for one in outcomes]
+    asked.list_runs = lambda: [
+        {**one.summary, "same_content_as": one.twin or None, "replaced": one.replaced or None}
+        for one in outcomes
+    ]
     if report:
         from pipeline.report.theme import warm_bundle  # noqa: PLC0415 - only for reports
 
@@ -120,7 +123,14 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         said = spell_choices(choices)
         for one in outcomes:
             is_same = not one.computed
-            text = format_run(one.summary, unchanged=is_same, twin=one.twin, said=said, everything=everything)
+            text = format_run(
+                one.summary,
+                unchanged=is_same,
+                twin=one.twin,
+                replaced=one.replaced,
+                said=said,
+                everything=everything,
+            )
             print_lines(text.splitlines())
     return exit_code(asked.errors, lossy=any(outcome.lossy or outcome.refusal for outcome in outcomes))
 
@@ -358,6 +368,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
     done = ", ".join(outcome.computed) or "nothing: all files are up to date"
     lines = [f"run       {outcome.manifest.run}", f"computed  {done}"]
     lines += [f"  {table:<12}{rows:>9} rows" for table, rows in tables.items()]
+    lines += [f"replaced  earlier results, {outcome.replaced}"] if outcome.replaced else []
     print_result(content, lambda: [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
     return LOSSY if outcome.lossy else CLEAN
 

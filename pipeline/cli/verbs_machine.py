@@ -65,6 +65,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     """
     for package in ("uvicorn", "starlette", "numba", "vl_convert"):
         require_package(package, "serve", "the workbench")
+    from pipeline.logs import SUFFIXES  # noqa: PLC0415 - heavy
     from pipeline.web import LOOPBACK, Limits  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 
@@ -91,9 +92,11 @@ def serve(  # noqa: D417 - the results folder documents itself
     )
     opened = ""
     # A folder that is not there yet is filled by dropped logs.
-    named = None if run is None else Path(run)
-    if named is not None and (named.is_dir() or not (named.exists() or store.Store(results).runs())):
-        results = named
+    is_new = run is not None and not (
+        Path(run).exists() or run.endswith(SUFFIXES) or store.Store(results).runs()
+    )
+    if run is not None and (Path(run).is_dir() or is_new):
+        results = Path(run)
     elif run is not None:
         opened = f"#{urlencode({'a': store.find_run(run, store.Store(results)).run})}"
     serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)

@@ -160,8 +160,9 @@ def status(  # noqa: D417 - arguments document themselves
     folder = open_results(results)
     if run is not None:
         manifest = store.find_run(run, folder)
-        content = {"run": manifest.run, "key": manifest.key, **manifest.details}
-        return print_result(content, lambda: _format_origin(manifest), json=json)
+        writer = folder.list_writers().get(manifest.home.relative_to(folder.root / store.RUNS).as_posix(), "")
+        content = {"run": manifest.run, "key": manifest.key, "writing": writer, **manifest.details}
+        return print_result(content, lambda: _format_origin(manifest, writer), json=json)
     status_now = read_status(folder)
     print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
     return FAILED if status_now.errors else CLEAN
@@ -174,6 +175,7 @@ def _as_json(status_now: Status) -> dict[str, object]:
         "bytes": status_now.bytes,
         "old_generations": status_now.old_generations,
         "last": status_now.last,
+        "writing": [{"run": run, "holder": holder} for run, holder in status_now.writers.items()],
         "logs": [
             {"path": entry.log.path, **{k: v for k, v in asdict(entry).items() if k != "log"}}
             for entry in status_now.entries
@@ -192,6 +194,7 @@ def _format_status(status_now: Status) -> list[str]:
     lines = [
         f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
         f"last batch    {last}",
+        *(f"writing       {run}, by {holder}" for run, holder in status_now.writers.items()),
     ]
     lines += format_counts(status_now.counts)
     for state in EXPLAINED:
@@ -319,12 +322,14 @@ def _format_check(verification: Verification) -> list[str]:
     return lines
 
 
-def _format_origin(manifest: store.Manifest) -> list[str]:
+def _format_origin(manifest: store.Manifest, writer: str) -> list[str]:
     details = manifest.details
     log = manifest.part("log")
     lines = [
         f"run            {manifest.run}",
+        *([f"writing        new results are being written, by {writer}"] if writer else []),
         f"generation     {manifest.key}    {manifest.folder}",
+        *(f"earlier        {folder}" for folder in store.list_old(manifest)),
         f"log            {log.get('path')}",
         f"sha256         {log.get('sha256')}",
         f"vehicle        {manifest.part('vehicle').get('name')}, dataset {details.get('dataset')}",

@@ -9,9 +9,12 @@ import os
 import re
 import stat
 import sys
+import threading
 import tomllib
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -219,6 +222,72 @@ MOST_ENTRIES: Final = 20_000_000
 
 Location = TypeVar("Location")
 Answer = TypeVar("Answer")
+
+
+def ask_within(question: Callable[[], Answer], patience_s: float) -> Answer:
+    """Result of a query about a file or folder, which may be on a mount that does not answer any more.
+
+    Args:
+        question: the query; it runs in a thread of its own, which is abandoned when it does not end.
+        patience_s: how long to wait for it [s].
+
+    Raises:
+        TimeoutError: there is no answer within that time.
+        OSError: whatever the query raises.
+    """
+    answer: Future[Answer] = Future()
+
+    def work() -> None:
+        try:
+            answer.set_result(question())
+        except Exception as error:  # noqa: BLE001 - it is raised where it was asked
+            answer.set_exception(error)
+
+    # A thread that can be abandoned: a call to a dead mount does not return.
+    threading.Thread(target=work, name="folders", daemon=True).start()
+    return answer.result(patience_s)
+
+
+def describe_silence(patience_s: float) -> str:
+    """Why a path that did not answer within a time [s] was left out."""
+    return f"it does not answer within {patience_s:g} s: is it on a mount that is gone?"
+
+
+def find_existing(paths: Iterable[str], patience_s: float) -> dict[str, bool | str]:
+    """Whether each path is there, or why that cannot be told.
+
+    Args:
+        paths: files and folders.
+        patience_s: how long to wait for an answer [s], once for each mount that does not answer.
+    """
+    found: dict[str, bool | str] = {}
+    answered: set[Path] = set()
+    silent: set[Path] = set()
+
+    def look(path: Path, asked: list[Path]) -> None:
+        # From the top: the first folder without an answer is the mount, and what is below it is not asked.
+        for place in (*reversed(path.parents), path):
+            if place not in answered:
+                asked.append(place)
+                place.stat()
+                answered.add(place)
+
+    for text in paths:
+        path, asked = Path(text), list[Path]()
+        if silent.isdisjoint((path, *path.parents)):
+            try:
+                ask_within(partial(look, path, asked), patience_s)
+            except TimeoutError:
+                silent.add(asked[-1])
+            except OSError as error:
+                gone = error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
+                found[text] = False if gone else f"it cannot be read ({error.strerror or error})"
+            except ValueError:
+                found[text] = False
+            else:
+                found[text] = True
+        found.setdefault(text, describe_silence(patience_s))
+    return found
 
 
 def walk_tree(

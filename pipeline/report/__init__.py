@@ -30,6 +30,7 @@ import polars as pl
 from pipeline.core import (
     LONGEST_TEXT,
     SlipError,
+    find_existing,
     format_part,
     format_share,
     mapping_in,
@@ -301,6 +302,7 @@ def render_catalogue(store: Store) -> str:
         Column("log"),
     ]
     gathered = _gather_rows(store, manifests) if manifests else []
+    noted = list_noted(store)
     rows = [
         {
             "run": row["run"],
@@ -319,10 +321,8 @@ def render_catalogue(store: Store) -> str:
         columns=columns,
         rows=rows,
         dated=_date_errors(gathered),
-        counts=[f"{count} {name_state(state)}" for state, count in count_logs(store).items() if count],
-        explained=[
-            {**one, "state": name_state(one["state"])} for one in list_noted(store) if one["state"] != "done"
-        ],
+        counts=[f"{count} {name_state(state)}" for state, count in count_logs(noted).items() if count],
+        explained=[{**one, "state": name_state(one["state"])} for one in noted if one["state"] != "done"],
     )
 
 
@@ -330,36 +330,45 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     """What became of each log, by path: ``path state reason hint``; without those since removed or moved.
 
     Of several logs of one run the first that is there counts, and the others are copies of it; where none is
-    there any more, the first is gone.
+    there any more, the first is gone. One of which nobody can say whether it is there is left out.
     """
     noted: list[dict[str, str]] = []
-    gone: list[tuple[str, str]] = []
+    absent: list[tuple[str, str, str, str]] = []
     holders: set[str] = set()
     notes = {str(mapping_in(note, "log").get("path", "")): note for note in store.notes(LOG_NOTES).read_all()}
+    existing = find_existing((path for path in sorted(notes) if "://" not in path), _PATIENCE_S)
     for path, note in sorted(notes.items()):
         texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
         run, has_run = str(note.get("run") or ""), texts["state"] not in _WITHOUT_RUN
-        if not ("://" in path or Path(path).exists()):
-            gone += [(path, run)] if has_run else []
+        is_there = existing.get(path, True)
+        if is_there is not True:
+            if is_there:
+                absent.append((path, run if has_run else "", "left_out", is_there))
+            elif has_run:
+                absent.append((path, run, "gone", _GONE))
             continue
         if has_run and run in holders:
             texts = {"state": "copy", "reason": run, "hint": ""}
         elif has_run:
             holders.add(run)
         noted.append({"path": path} | texts)
-    for path, run in gone:
-        if run not in holders:
+    for path, run, state, reason in absent:
+        if not run or run not in holders:
             holders.add(run)
-            noted.append({"path": path, "state": "gone", "reason": _GONE, "hint": ""})
+            noted.append({"path": path, "state": state, "reason": reason, "hint": ""})
     return sorted(noted, key=lambda one: one["path"])
 
 
 _GONE = "the log is not there any more; its results are kept"
 
 
-def count_logs(store: Store) -> dict[str, int]:
-    """How many logs of batches came out how, by each of `LOG_STATES`: the numbers of every face."""
-    states = [one["state"] for one in list_noted(store)]
+_PATIENCE_S = 5.0
+"""How long the mount of a log may take to answer [s]: a dead one never does."""
+
+
+def count_logs(noted: Iterable[Mapping[str, str]]) -> dict[str, int]:
+    """How many logs of `list_noted` came out how, by each of `LOG_STATES`: the numbers of every face."""
+    states = [one["state"] for one in noted]
     return {state: states.count(state) for state in LOG_STATES}
 
 

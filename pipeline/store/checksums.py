@@ -70,7 +70,7 @@ def decode_checked(data: bytes) -> dict[str, object]:
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs."""
-LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored", "gone")
+LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored", "left_out", "gone")
 """What became of a log of a batch; each log counts once, and each run has one log."""
 
 

@@ -1,6 +1,7 @@
 """Files that are there whole or not at all, folders, and locks: one writer at a time."""
 
 import errno
+import fcntl
 import hashlib
 import os
 import platform
@@ -136,7 +137,7 @@ def hold_lock(path: Path, *, patience_s: float) -> Iterator[None]:
     """Hold the lock file ``path`` for the length of the block.
 
     The file stays: removing it would let two writers hold two files of one name. What stands in it only
-    serves the message to those who wait.
+    serves the message to those who wait, and who ask.
 
     A file system without locks (some network mounts) is refused: a file that merely exists would outlive a
     writer that was killed.
@@ -179,6 +180,19 @@ def read_holder(path: Path) -> str:
     with suppress(OSError):
         return path.read_text(encoding="utf-8", errors="replace")[:200] or "another process"
     return "another process"
+
+
+def find_holder(path: Path) -> str:
+    """Who holds a lock now, as its file says; empty where nobody does.
+
+    What a killed holder noted is still there; it does not count. Nothing is written.
+    """
+    with suppress(OSError), path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return read_holder(path)
+    return ""
 
 
 def hash_bytes(data: bytes) -> str:

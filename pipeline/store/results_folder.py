@@ -15,6 +15,7 @@ from pipeline.core import read_bounded_text, shorten
 from pipeline.store.checksums import Notes
 from pipeline.store.files import (
     TEMPORARY,
+    find_holder,
     hash_bytes,
     hold_lock,
     make_folder,
@@ -132,6 +133,13 @@ class Store:
         return tuple(
             sorted(path.parent for depth in ("*", "*/*") for path in top.glob(f"{depth}/{MANIFEST}"))
         )
+
+    def list_writers(self) -> dict[str, str]:
+        """Who writes which run now: holders by the path of the run's folder below ``runs``."""
+        top = self.root / RUNS
+        locks = sorted(path for depth in ("*", "*/*") for path in top.glob(f"{depth}/{LOCK}"))
+        held = ((path.parent.relative_to(top).as_posix(), find_holder(path)) for path in locks)
+        return {name: holder for name, holder in held if holder}
 
     @contextmanager
     def open_generation(self, run: str, key: str) -> Iterator[Generation]:

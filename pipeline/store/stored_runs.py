@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from shlex import quote
 from stat import S_ISDIR
 
 from pipeline.core import SlipError, guess_names, resolve_inside
@@ -59,13 +60,6 @@ def find_run(text: str, store: Store) -> Manifest:
     """
     survey = store.survey()
     manifests = survey.manifests
-    if not manifests:
-        unread = f"; {len(survey.errors)} cannot be read" if survey.errors else ""
-        gone = "" if store.root.exists() else " (the folder of results does not exist)"
-        what = f"no run has been analyzed yet{gone}{unread}"
-        if not Path(text).exists():
-            what = f"{text!r} is neither a log nor a run: there is no such file or folder, and {what}"
-        raise StoreError("no_such_run", what, where=str(store.root), hint=ANALYZE_FIRST)
     path = spell_location(Path(text).resolve())
     fitting = [
         manifest
@@ -74,6 +68,18 @@ def find_run(text: str, store: Store) -> Manifest:
     ]
     if len(fitting) == 1:
         return fitting[0]
+    if not fitting and Path(text).exists():
+        what = f"it has no results in {store.root}"
+        hint = f"Analyze it first: slip analyze {quote(text)} --results {quote(str(store.root))}."
+        raise StoreError("no_such_run", what, where=text, hint=hint)
+    if not manifests:
+        unread = f"; {len(survey.errors)} cannot be read" if survey.errors else ""
+        gone = "" if store.root.exists() else " (the folder of results does not exist)"
+        what = (
+            f"{text!r} is neither a log nor a run: there is no such file or folder, and no run has been "
+            f"analyzed yet{gone}{unread}"
+        )
+        raise StoreError("no_such_run", what, where=str(store.root), hint=ANALYZE_FIRST)
     names = ", ".join(manifest.run for manifest in (fitting or manifests))
     what = f"several runs are called {text!r}" if fitting else f"there is no run {text!r}"
     known = [manifest.run if "/" in text else manifest.run.rsplit("/", 1)[-1] for manifest in manifests]

@@ -1,7 +1,10 @@
 """Counts and lists of a batch are those of one table on every face; a dead log can be ignored."""
 
 import json
+import os
 import re
+import threading
+import time
 from html import unescape
 from pathlib import Path
 
@@ -52,6 +55,37 @@ def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
     screen = run_verb(*words[:8], cwd=folder).stdout
     assert re.search(r"^ignored +1$", screen, re.MULTILINE)
     assert 'ignore = "dead*"' in screen
+
+
+def test_a_dead_mount_does_not_hold_who_asks_for_the_status(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of its logs is left out, with the reason; the others count as before."""
+    for name in ("one", "two"):
+        (folder / "dead").mkdir(exist_ok=True)
+        (folder / "dead" / f"{name}.mcap").write_text(f"no recording {name}\n" * 100)
+    words = ("batch", "field", "dead", "--settle", "0", "--executor", "inline", "--results", "season")
+    run_verb(*words, cwd=folder)
+    never, stat = threading.Event(), os.stat
+
+    def hang(place: str | Path, **options: bool) -> os.stat_result:
+        if "dead" in Path(place).parts:
+            never.wait()
+        return stat(place, **options)
+
+    monkeypatch.setattr("pipeline.report._PATIENCE_S", 0.2)
+    monkeypatch.setattr("os.stat", hang)
+    started = time.monotonic()
+    status = json.loads(run_verb("results", "status", "--results", "season", "--json", cwd=folder).stdout)
+    page = render_catalogue(Store(folder / "season"))
+    assert time.monotonic() - started < 10.0, "one wait for a mount, not one for each log"
+    never.set()
+    counts = {state: status[state] for state in LOG_STATES if status[state]}
+    assert counts == {"done": 1, "lossy": 1, "failed": 1, "copy": 1, "ignored": 1, "left_out": 2}
+    left = [one for one in status["logs"] if one["state"] == "left_out"]
+    assert [Path(one["path"]).name for one in left] == ["one.mcap", "two.mcap"]
+    assert all("does not answer within 0.2 s" in one["reason"] for one in left)
+    assert "2 left out" in page
 
 
 def test_a_log_that_is_no_longer_ignored_is_read(folder: Path) -> None:

@@ -1,10 +1,11 @@
 """The command line as scripts and people use it: output, exit codes, one clear line for every error."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
-from verbs import run_program, run_verb
+from verbs import ask_verb, print_verb, run_program, run_verb
 
 from pipeline.simulate import simulate_case
 
@@ -74,6 +75,44 @@ def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
 
     by_run = run_verb("results", "stage", "slip", "good", "--results", tmp_path, "--json")
     assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]
+
+
+def test_results_that_were_made_otherwise_are_not_replaced_without_a_word(
+    field: Path, tmp_path: Path
+) -> None:
+    """One line says what they were made with, and where they are kept; the same options say nothing."""
+    log = Path(shutil.copytree(field, tmp_path / "field")) / "good.mcap"
+    analyze = ("analyze", log, "--no-report", "--no-diagnosis", "--results", tmp_path / "out")
+    every = (*analyze, "--interval", "all")
+    first = tmp_path / "out" / "runs" / "field" / "good" / "generation-1"
+
+    assert "replaced" not in print_verb(*analyze)
+    assert "replaced" not in print_verb(*analyze, "--force")
+    kept = {path.name: path.read_bytes() for path in first.iterdir()}
+    (line,) = [one for one in print_verb(*every).splitlines() if one.startswith("replaced")]
+    assert "earlier results, made with use_intervals = recorded (now all); they are kept in" in line
+    assert "generation-2 until slip batch --prune" in line
+    assert {path.name: path.read_bytes() for path in first.iterdir()} == kept
+    status = print_verb("results", "status", "good", "--results", tmp_path / "out")
+    assert [line.split("/")[-1] for line in status.splitlines() if line.startswith("earlier")] == [
+        "generation-2",
+        "generation-1",
+    ]
+    assert print_verb(*analyze, "--quiet") == ""
+    (run,) = ask_verb(*every)["runs"]
+    assert run["replaced"].startswith("made with use_intervals = recorded (now all); ")
+    model = tmp_path / "model.toml"
+    print_verb("model", "new", model, "effective_track", "--vehicle", "husky_a200")
+    assert (
+        "made with use_intervals = all (now recorded) and model = not set (now model.toml); "
+        in print_verb(*analyze, "--model", model)
+    )
+    batch = ("batch", log, "--executor", "inline", "--results", tmp_path / "out", "--vehicle", "warthog")
+    assert "earlier results, made with vehicle.preset = not set (now warthog)" in print_verb(*batch)
+    (line,) = ask_verb(*batch[:-1], "husky_a200")["logs"]
+    assert line["replaced"].startswith("made with vehicle.preset = warthog (now husky_a200); ")
+    stage = ("results", "stage", "slip", log, "--results", tmp_path / "out", "--force")
+    assert "with a summary, which the new ones lack; " in print_verb(*stage)
 
 
 def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None:

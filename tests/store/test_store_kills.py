@@ -5,6 +5,7 @@ import fcntl
 import multiprocessing
 import os
 import random
+import re
 import resource
 import signal
 import sys
@@ -285,8 +286,14 @@ def test_waiting_ends_with_the_name_of_the_holder_and_death_releases(
         with pytest.raises(StoreError, match=f"process {holder.pid} on") as caught:
             write_generation(hasty, RUN, "new", 1)
         assert caught.value.code == "locked"
+        (told,) = store.list_writers().items()
+        assert told[0] == RUN
+        assert re.fullmatch(rf"process {holder.pid} on \S+ \(since 20[\d: -]+\)", told[1])
         holder.kill()
         holder.wait()
+        # What the dead one noted is still there, and nobody is told that it writes.
+        assert (store.root / "runs" / RUN / ".lock").read_bytes()
+        assert store.list_writers() == {}
         # A child that outlives a killed writer does not keep its lock.
         write_generation(hasty, RUN, "new", 1)
     finally:
