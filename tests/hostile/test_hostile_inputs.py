@@ -59,7 +59,7 @@ WORDS: list[tuple[str, str]] = [
     ("watch missing.mcap", r"missing\.mcap: there is no such file\. Check the path\."),
     ("watch folder --for 1", "the folder holds no MCAP file"),
     ("export missing --to csv", "missing"),
-    ("export text.mcap --to csv", r"text\.mcap: it has no results in results\. Analyze it first: slip analyze text"),
+    ("export text.mcap --to csv", r"text\.mcap: it has no results in results\. Analyze it first: slip"),
     ("results status text.mcap", r"slip analyze text\.mcap --results results\."),
     ("serve text.mcap", "text.mcap: it has no results in results"),
     ("serve missing.mcap --results nowhere", r"nowhere: 'missing\.mcap' is neither a log nor a run"),
