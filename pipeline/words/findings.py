@@ -1188,7 +1188,8 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "run.toml name two topics, as of a gyro)",
     "pose_angle": _pose_angle,
     "pose_lever": _pose_lever,
-    "command_timeout": {"held": _command_timeout, "in bursts": _commands_in_bursts},
+    "command_timeout": _command_timeout,
+    "commands_in_bursts": _commands_in_bursts,
     "command_delay": _command_delay,
     "command_late": _command_late,
     "speeds_of_positions": "its speeds are differences of its positions, and scatter as the times between "
