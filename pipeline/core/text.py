@@ -210,6 +210,8 @@ moves a value by a seventh of that half at most; with twice as many a digit is c
 lost."""
 _UNEVEN = 0.1
 """Least half of an interval over the other half for the digits to follow it: one may be cut at a bound."""
+_NOTHING = 1e-3
+"""Part of an interval's half that a value has no digit below."""
 
 
 def count_places(half: float) -> int:
@@ -221,14 +223,16 @@ def split_interval(value: float, low: float, high: float) -> tuple[str, str, str
     """A value and the ends of its interval with the digits that the interval supports.
 
     The last digit is that of the narrower half, so that both ends differ from the value as printed; a value
-    has one digit at least.
+    has one digit at least, unless it is smaller than a thousandth of that.
     """
     halves = value - low, high - value
     half = max(min(halves), _UNEVEN * max(halves))
     if not 0.0 < half < math.inf:
         return f"{value:.3g}", f"{low:.3g}", f"{high:.3g}"
     # Whole numbers at the coarsest: in tens, an end near zero would be zero.
-    places = max(count_places(half), 0, -math.floor(math.log10(abs(value))) if value else 0)
+    places = max(count_places(half), 0)
+    if abs(value) > _NOTHING * half:
+        places = max(places, -math.floor(math.log10(abs(value))))
     value_text, low_text, high_text = (f"{one:z.{places}f}" for one in (value, low, high))
     return value_text, low_text, high_text
 

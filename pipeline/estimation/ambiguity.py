@@ -119,11 +119,11 @@ def read_clocks(data: EstimationData, outcome: SearchResult, source: Input) -> C
     late_effects: list[Effect] = []
     late, heading_delay = float(np.mean(positions)), float(np.mean(skews))
     # Only a heading older than its position is reported as such; the opposite is a late position.
-    skewed = extra is not None and data.has_gyro and heading_delay < 0.0
+    is_named = extra is not None and extra.id in {*outcome.new, *outcome.start.ids}
+    skewed = is_named and data.has_gyro and heading_delay < 0.0
     if skewed:
         late_effects.append(find_late_effect(Late.HEADING).of_delay(-heading_delay))
     least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
-    is_named = extra is not None and extra.id in {*outcome.new, *outcome.start.ids}
     known = any(certain) if data.has_gyro else is_named
     if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)

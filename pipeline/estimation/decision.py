@@ -639,7 +639,7 @@ def judge(
     else:
         is_proven = True
         if felt < SHOWN:
-            refusal = f"no error falls by more than {format_share(felt)}"
+            refusal = f"no error falls by more than {format_share(felt)}, required {format_share(SHOWN)}"
         elif not _is_material(path, change):
             refusal = "what it moves is less than a map resolves"
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)

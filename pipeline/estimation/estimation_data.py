@@ -169,7 +169,8 @@ class EstimationData:
         exceeded = self.exceeded
         slope = max(run_residuals.context.slope_rad for run_residuals in self.residuals_by_run)
         course = any(run.is_on_course for run in self.runs)
-        return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope, course)
+        bursts = any(run.in_bursts for run in self.runs)
+        return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope, course, bursts)
 
     @property
     def sampling_s(self) -> float:

@@ -584,6 +584,16 @@ def has_encoders(effect: Effect, conditions: Conditions) -> bool:
     return conditions.encoders
 
 
+def has_timed_encoders(effect: Effect, conditions: Conditions) -> bool:
+    """`Effect.can_show` of gains: in bursts only their product with the duration of one is known."""
+    return conditions.encoders and not conditions.bursts
+
+
+def has_speed(effect: Effect, conditions: Conditions) -> bool:
+    """`Effect.can_show` of a factor on what the body does: in bursts their duration does the same."""
+    return conditions.encoders or not conditions.bursts
+
+
 def has_no_encoders(effect: Effect, conditions: Conditions) -> bool:
     """`Effect.is_equivalent` of what measured wheels tell from another effect."""
     return not conditions.encoders

@@ -171,6 +171,7 @@ class Conditions:
             `turn`, `wheel`.
         slope_rad: half of the range of pitch over nine tenths of the time; zero where it was not recorded.
         course: whether the heading of a run is its course over ground, which no position can precede.
+        bursts: whether a run was taken to be as fast as commanded, to find how long a command acts.
     """
 
     largest: Largest
@@ -180,6 +181,7 @@ class Conditions:
     exceeded: Mapping[str, float] = field(default_factory=dict)
     slope_rad: float = 0.0
     course: bool = False
+    bursts: bool = False
 
     def attain(self, limit: float, of: Relative) -> bool:
         """Whether commands exceeded a limit, and measured wheels, if any, reached it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -98,6 +98,19 @@ NO_CANDIDATE = Candidate(DriveSource(DriveForm.BODY, (), ""), Reading(), 0, is_m
 """What a log has for a role for which it has nothing."""
 _MOST_GAIN = 2.0
 """Largest turn of a body over that which a signal states as its motion."""
+
+
+_APART = 2.0
+"""Ratio of the gains of two halves from which on they are not one unit's: nearly the square root of the least
+factor between two units, 3.6."""
+
+
+def are_apart(halves: Sequence[float]) -> bool:
+    """Whether the gains of both halves of a drive contradict each other."""
+    if not halves:
+        return False
+    low, high = sorted(abs(gain) for gain in halves)
+    return high >= _APART * low or min(halves) < 0.0 < max(halves)
 
 
 def is_crossed(drive: Candidate) -> bool:
@@ -300,8 +313,9 @@ class Case:
         change: dict[str, object],
         margin: float | None = None,
         usual: str = "",
-    ) -> None:
-        """Apply a correction, or tell it where the user's configuration decides otherwise.
+        halves: Sequence[float] = (),
+    ) -> bool:
+        """Apply a correction, or tell it where the configuration or parts of the drive say otherwise.
 
         Args:
             section: of the configuration.
@@ -311,6 +325,11 @@ class Case:
             change: keys with their values.
             margin: Vuong's statistic of the correction.
             usual: unit that takes speeds as they are recorded.
+            halves: gains by which it is made, in both halves of the drive; none where a statistic over its
+                blocks decides.
+
+        Returns:
+            Whether it was applied.
         """
         default = type(getattr(self.configuration, section))()
         given = [
@@ -324,15 +343,20 @@ class Case:
         wrong = {**values, "kind": "configured", "fault": fault, "given": given, "value": margin}
         if given and section == "pose":
             self.findings.append(Finding("pose_contradicted", "warning", section, wrong))
-            return
+            return False
         if given:
             self.findings.append(Finding("signs_contradict", "error", section, wrong))
-            return
+            return False
+        if are_apart(halves):
+            wrong = {**wrong, "line": line, "halves": list(halves)}
+            self.findings.append(Finding("halves_contradict", "warning", section, wrong))
+            return False
         self.changes.setdefault(section, {}).update(change)
         as_recorded = {**_AS_RECORDED[section]} | ({"unit": f'unit = "{usual}"'} if usual else {})
         settled = [text for key, text in as_recorded.items() if key in change]
         wrong |= {"kind": "corrected", "line": line, "otherwise": settled}
         self.findings.append(Finding(name, "warning", section, wrong))
+        return True
 
     def complete(self) -> Configuration:
         """The user's configuration with the corrections."""

@@ -4,17 +4,27 @@ Commands and wheels are ideal velocities of the body. The wheels follow the comm
 that are fitted; what remains is a factor, which is that of slow driving: there the drive does not saturate.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, SlipError, fit_robustly, pick, robust_spread
-from pipeline.recording.case import Case
+from pipeline.core import (
+    Flags,
+    Floats,
+    Ints,
+    SlipError,
+    fit_robustly,
+    list_likelihoods,
+    pick,
+    robust_spread,
+)
+from pipeline.recording.case import Case, are_apart
+from pipeline.recording.evidence import Axis
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
-from pipeline.recording.motion import FEWEST_STEPS, ONE_SCALE
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, ONE_SCALE, compare
 from pipeline.recording.readings import Held, Reading
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import DriveForm, Vehicle, list_presets
@@ -27,6 +37,36 @@ on `husky_snow_boreal` and 0.96 to 1.04 on the other recordings."""
 _SAME = 0.05
 """Absolute logarithm of a ratio below which it is that of two radii: on recordings with the right scale it is
 0.04 at most."""
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """Commanded and measured rates over steps of a tenth of a second.
+
+    Attributes:
+        asked, got: speeds [m/s] and yaw rates [rad/s], shape (n,) each.
+        block: number of each step's block, shape (n,).
+    """
+
+    asked: tuple[Floats, Floats]
+    got: tuple[Floats, Floats]
+    block: Ints
+
+    def is_better(self, scales: tuple[float, float]) -> bool:
+        """Whether wheels follow a scaled command clearly better, and neither ahead nor in turns worse.
+
+        Either command may ask for more than the drive does: wheels at their limit tell nothing.
+        """
+        gains = []
+        for scale, asked, got in zip(scales, self.asked, self.got, strict=True):
+            top = float(np.quantile(np.abs(got), 0.99))
+            one, other = (
+                list_likelihoods(got - np.clip(factor * asked, -top, top)) for factor in (scale, 1.0)
+            )
+            gains.append(np.bincount(self.block, one - other).astype(np.float64))
+        nothing = np.zeros(gains[0].size)
+        least = min(compare(one, nothing) for one in gains)
+        return least > -CLEAR and compare(gains[0] + gains[1], nothing) > CLEAR
 
 
 def measure_command_scale(
@@ -53,14 +93,14 @@ def measure_command_scale(
         The corrections of the command, neutral where nothing shows them, and findings on them.
     """
     neutral = Alignment(track_multiplier=vehicle.controller_track_multiplier)
-    asked, got = _compare_rates(commands, wheels, vehicle, late)
-    forward, turning = (find_ratio(*pair) for pair in zip(asked, got, strict=True))
+    driven = _compare_rates(commands, wheels, vehicle, late)
+    forward, turning = (find_ratio(*pair) for pair in zip(driven.asked, driven.got, strict=True))
     if forward is None:
         return neutral, ()
     is_right = gain is not None and abs(np.log(gain)) < abs(np.log(gain / forward))
     if abs(np.log(forward)) > _SCALED and not is_right:
-        turning = _find_median(asked[1], got[1]) or forward
-        return _explain_scale(neutral, (forward, turning), vehicle, body_commanded=body_commanded)
+        turning = _find_median(driven.asked[1], driven.got[1]) or forward
+        return _explain_scale(neutral, (forward, turning), driven, vehicle, body_commanded=body_commanded)
     if abs(np.log(forward)) > _SCALED:
         return neutral, (_report_wheels(forward, vehicle),)
     if turning is None or not body_commanded or not _is_multiplied(turning / forward, vehicle):
@@ -79,11 +119,12 @@ def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
 
 
 def _explain_scale(
-    neutral: Alignment, ratios: tuple[float, float], vehicle: Vehicle, *, body_commanded: bool
+    neutral: Alignment, ratios: tuple[float, float], driven: _Rates, vehicle: Vehicle, *, body_commanded: bool
 ) -> tuple[Alignment, tuple[Finding, ...]]:
     """One factor on the whole command, or the geometry of another vehicle where that contradicts turns.
 
-    A factor that makes turns worse is told, and not applied: a gain of the drive would have to undo it.
+    A factor with which the wheels do not clearly follow better, in all driving and turning, is told, and not
+    applied: a gain of the drive would have to undo it.
     """
     forward, turning = ratios
     scales, other = (forward, forward), None
@@ -92,9 +133,9 @@ def _explain_scale(
         values["turning"] = turning
         if not body_commanded and turning > 0.0:
             scales, other = _find_geometry(scales, turning, vehicle)
-        is_worse = turning <= 0.0 or abs(np.log(turning / forward)) >= abs(np.log(turning))
-        if other is None and is_worse:
-            values["kind"], scales = "of speeds alone", (1.0, 1.0)
+    if not driven.is_better(scales):
+        values |= {"kind": "not followed", "value": forward}
+        return neutral, (Finding("command_scale", "warning", "command", values),)
     if other is not None:
         values["vehicle"] = pick(other, "name", "wheel_radius_m", "track_width_m")
     values |= {"value": scales[0], "turn_scale": scales[1]}
@@ -129,13 +170,9 @@ def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
     return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
 
 
-_Rates = tuple[Floats, Floats]
-"""Speeds [m/s] and yaw rates [rad/s], shape (n,) each."""
-
-
 def _compare_rates(
     commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, late: tuple[float, float]
-) -> tuple[_Rates, _Rates]:
+) -> _Rates:
     """Commanded and measured rates over steps of a tenth of a second; empty where nothing can be compared.
 
     Commands are lagged and delayed as the wheels follow them best.
@@ -144,11 +181,12 @@ def _compare_rates(
     motion = roll_wheels(got)
     nothing: Floats = np.zeros(0)
     if not (motion.is_known and asked.inputs):
-        return (nothing, nothing), (nothing, nothing)
+        return _Rates((nothing, nothing), (nothing, nothing), np.zeros(0, dtype=np.int64))
     motion = motion.take(np.logical_and.reduce([one.is_there(motion.steps) for one in asked.inputs]))
     elapsed = motion.steps.end - motion.steps.start
     ahead, turned = asked.columns(motion.steps, *late, crossed=False)
-    return (ahead / elapsed, turned / elapsed), (motion.body.real / elapsed, motion.yaw / elapsed)
+    rates = motion.body.real / elapsed, motion.yaw / elapsed
+    return _Rates((ahead / elapsed, turned / elapsed), rates, motion.steps.block)
 
 
 def roll(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats]:
@@ -207,7 +245,8 @@ def _take_as_followed(case: Case, alignment: Alignment) -> Alignment:
     explained = command.reading.explained
     fits = (explained.ahead, explained.turned)
     scales = [abs(float(one.gains[0])) / of for one, of in zip(fits, case.command_factors(), strict=True)]
-    seen = [command.sign("ahead") != 0, command.sign("turned") != 0]
+    axes: tuple[Axis, ...] = ("ahead", "turned")
+    seen = [command.sign(axis) != 0 and not are_apart(command.reading.fit_halves(axis)) for axis in axes]
     ahead, turn = (scale if known else 1.0 for scale, known in zip(scales, seen, strict=True))
     values = {"kind": "without a unit", "value": ahead, "turn": turn, "source": str(command.source)}
     case.findings.append(Finding("command_scale", "warning", "command", values))

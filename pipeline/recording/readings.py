@@ -31,6 +31,8 @@ _SLOW_S = 0.4
 """Period [s] from which on a signal may be sent on changes only: then it holds until the next one."""
 _FEWEST_CHANGES = 4
 """Least number of messages of a command: a start and a stop ahead, and of a turn."""
+_LEAST = 1e-6
+"""Size up to which a value is rounding in any unit, as 4e-9 m/s ahead of a base that goes to its side."""
 _FEW_CELLS = 2.0
 """Cells of the grid without a signal that are no gap."""
 _LONGEST_S = 6.0 * 3600.0
@@ -64,8 +66,8 @@ class Held:
         read = self.values[live]
         # A command that is sent on changes only has few messages, and says something all the time.
         enough = read.size >= (_FEWEST_CHANGES if may_stand else FEWEST_STEPS)
-        self.is_constant = not (enough and bool(np.ptp(read) > 0.0))
-        self.moves = not self.is_constant or (enough and may_stand and bool(read.any()))
+        self.is_constant = not (enough and bool(np.ptp(read) > _LEAST))
+        self.moves = not self.is_constant or (enough and may_stand and bool((np.abs(read) > _LEAST).any()))
         self._sums: dict[float, Floats] = {}
         self._is_known = enough
         if not enough:
@@ -322,6 +324,26 @@ class Reading:
         if self.form == "sides":
             return (0.5 * (one - two), -one - two) if crossed else (0.5 * (one + two), two - one)
         return (two, one) if crossed and self.form == "body" else (one, two)
+
+    def fit_halves(self, channel: str) -> tuple[float, ...]:
+        """Gains of ``ahead`` or ``turned`` in two halves, each with half of its path.
+
+        Returns:
+            Two gains; none where one of them is not clear.
+        """
+        made = self.explained
+        motion, is_ahead = made.motion, channel == "ahead"
+        if not made.is_known:
+            return ()
+        columns = self.columns(motion.steps, made.lag, made.delay, crossed=made.crossed)
+        column, values = (columns[0], motion.body.real) if is_ahead else (columns[1], motion.yaw)
+        path = np.cumsum(np.abs(values))
+        first = path < 0.5 * path[-1]
+        if min(first.sum(), (~first).sum()) < FEWEST_STEPS:
+            return ()
+        fits = [fit(values[half], column[half, None], motion.steps.take(half)) for half in (first, ~first)]
+        is_clear = all(abs(float(one.t[0])) > CLEAR for one in fits)
+        return tuple(float(one.gains[0]) for one in fits) if is_clear else ()
 
     def columns_aside(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> Floats:
         """Increments to the left, in the reading's own units; none, or one, of shape (n, 1)."""

@@ -26,7 +26,7 @@ from pipeline.recording.readings import (
     Held,
     Reading,
 )
-from pipeline.run import LIVE_SHARE
+from pipeline.run import IN_BURSTS, LIVE_SHARE
 
 _PERIODS = 3.0
 """Gap in the commands [usual periods] above which they are silent: a shorter one is jitter."""
@@ -88,13 +88,15 @@ def ask_timeout(case: Case) -> Case:
     timeout = timeout or bursts
     if timeout is None:
         return case
-    if bursts is not None:
+    given_s = case.configuration.command.hold_s
+    in_bursts = bursts is not None and not given_s
+    if bursts is not None and in_bursts:
         timeout = _take_as_fast(command.reading, bursts, motion)
-    hold_s = case.configuration.command.hold_s or timeout.seconds
+    hold_s = given_s or timeout.seconds
     case.changes.setdefault("command", {})["hold_s"] = hold_s
-    case.findings.append(_report(timeout, hold_s, in_bursts=bursts is not None))
+    case.findings.append(_report(timeout, hold_s, in_bursts=in_bursts))
     held = hold(command.reading, hold_s).fitted(motion)
-    return replace(case, command=replace(command, reading=held), in_bursts=bursts is not None)
+    return replace(case, command=replace(command, reading=held), in_bursts=in_bursts)
 
 
 _GAINS = (0.8, 1.25)
@@ -128,14 +130,15 @@ def _take_as_fast(reading: Reading, bursts: CommandTimeout, motion: Motion) -> C
 
 def _report(timeout: CommandTimeout, hold_s: float, *, in_bursts: bool) -> Finding:
     values = {
-        "kind": "in bursts" if in_bursts else "held",
         "value": timeout.seconds,
         "count": timeout.silences,
         "low": timeout.low,
         "high": timeout.high,
         "hold_s": hold_s,
     }
-    return Finding("command_timeout", "warning" if in_bursts else "info", "command", values)
+    if in_bursts:
+        return Finding(IN_BURSTS, "warning", "command", values)
+    return Finding("command_timeout", "info", "command", values)
 
 
 def find_timeout(reading: Reading, motion: Motion, lever: float) -> CommandTimeout | None:
@@ -373,8 +376,10 @@ def _hold(one: Held, seconds: float, period: float) -> Held:
     for row in np.flatnonzero(gaps > min(seconds, _PERIODS * period)).tolist():
         # Signals are read on a grid: samples nearer to each other say nothing more.
         step = max(period, GRID_S)
-        after = np.arange(step, gaps[row], step)
-        if seconds < gaps[row]:
+        # None at the next message itself, which it would replace.
+        end = gaps[row] - 0.5 * GRID_S
+        after = np.arange(step, end, step)
+        if seconds < end:
             after = np.sort(np.append(after, seconds))
         times.append(one.times[row] + after)
         values.append(np.where(after < seconds, one.values[row], 0.0))

@@ -22,7 +22,7 @@ from pipeline.recording.evidence import (
 )
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import measure_motion
-from pipeline.recording.readings import Bent
+from pipeline.recording.readings import Bent, Reading
 from pipeline.sources import DriveForm, PoseContent, plain_type
 
 JOYSTICK = "sensor_msgs/Joy"
@@ -42,7 +42,9 @@ def ask_gyro(case: Case) -> Case:
         return case
     if abs(np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])) > 4.0 * _NEAR:
         return case
-    case.correct("imu", "gyro in degrees", {"gyro": gyro.name}, 'unit = "deg/s"', {"unit": "deg/s"})
+    line, about, halves = 'unit = "deg/s"', {"gyro": gyro.name}, gyro.fit_halves("turned")
+    if not case.correct("imu", "gyro in degrees", about, line, {"unit": "deg/s"}, halves=halves):
+        return case
     # Headings of positions alone are made of the gyro.
     case = replace(case, extraction=case.extraction.configure(imu=case.complete().imu))
     again = measure_motion(case.extraction.poses())
@@ -54,16 +56,20 @@ def ask_metres(case: Case) -> Case:
     source, motion = case.sources.pose, case.motion
     if source is None or source.content is not PoseContent.POSE or case.configuration.pose.unit:
         return case
-    gains: dict[str, float | None] = {"body": None, "sides": None, "steering": None}
-    for drive in (case.command, case.wheels):
-        if drive.sign("ahead") and not is_crossed(drive):
-            gains[drive.reading.form] = abs(float(drive.reading.explained.ahead.gains[0]))
+    drives = {
+        drive.reading.form: drive.reading
+        for drive in (case.command, case.wheels)
+        if drive.sign("ahead") and not is_crossed(drive)
+    }
+    gains = {form: abs(float(one.explained.ahead.gains[0])) for form, one in drives.items()}
     radius = case.vehicle.wheel_radius_m if case.is_known else None
-    unit = find_pose_unit(gains["body"] or gains["steering"], gains["sides"], radius)
+    unit = find_pose_unit(gains.get("body") or gains.get("steering"), gains.get("sides"), radius)
     if unit == "m":
         return case
-    values = {"source": str(source), "unit": unit}
-    case.correct("pose", "unit of positions", values, f'unit = "{unit}"', {"unit": unit})
+    values, line = {"source": str(source), "unit": unit}, f'unit = "{unit}"'
+    halves = next(iter(drives.values())).fit_halves("ahead")
+    if not case.correct("pose", "unit of positions", values, line, {"unit": unit}, halves=halves):
+        return case
     case = replace(case, extraction=case.extraction.configure(pose=case.complete().pose))
     scaled = measure_motion(case.extraction.poses())
     return case.fit(scaled.turn(flip=motion.flip, offset_deg=motion.offset_deg)) if scaled.is_known else case
@@ -122,7 +128,8 @@ def _find_driven_unit(case: Case) -> None:
     explained = command.reading.explained
     is_open = wheels.reading.form == "sides" and not case.is_known and command.reading.form != "sides"
     if is_open and command.sign("ahead"):
-        correct_wheel_unit(case, wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
+        gain = 1.0 / abs(float(explained.ahead.gains[0]))
+        _correct_wheel_unit(case, wheels, command.reading, gain, explained.shares[0])
 
 
 def _find_body_units(case: Case) -> bool:
@@ -165,7 +172,8 @@ def _find_side_unit(case: Case) -> None:
         radius = case.vehicle.wheel_radius_m if case.is_known else None
         gain = float(explained.ahead.gains[0])
         turn = float(explained.turned.gains[0]) if command.sign("turned") else None
-        correct_wheel_unit(case, command, gain, explained.shares[0], radius, turn, "command")
+        share = explained.shares[0]
+        _correct_wheel_unit(case, command, command.reading, gain, share, radius, turn, "command")
 
 
 def _find_speed_units(case: Case) -> list[bool]:
@@ -213,9 +221,15 @@ def _report_units(
         if unit not in USUAL:
             speed, gain = units.likeliest[0], gains[0]
             is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
-            is_scaled = is_scaled and is_sure
             values = {**of, "is_sure": bool(is_sure)}
-            case.correct(role, "unit of a drive", values, f'{key} = "{unit}"', {key: unit}, usual="m/s")
+            line = f'{key} = "{unit}"'
+            # An angle is read in the unit by which the body turns.
+            axis = "" if key == "steering_unit" else ("ahead", "turned")[index]
+            halves = drive.reading.fit_halves(axis) if axis else ()
+            is_made = case.correct(
+                role, "unit of a drive", values, line, {key: unit}, usual="m/s", halves=halves
+            )
+            is_scaled = is_scaled and (is_sure or not is_made)
         elif units.rival is not None and units.rival[index] != unit:
             other, gain = units.rival[index], gains[index]
             values = {**of, "other": other, "key": key}
@@ -229,22 +243,24 @@ def _find_wheel_unit(case: Case) -> None:
     """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
     command, wheels = case.command, case.wheels
     explained, share, turn = wheels.reading.explained, 1.0, None
+    by = wheels.reading
     radius, driven = case.vehicle.wheel_radius_m if case.is_known else None, case.driven
     if radius is not None and driven.sign("ahead") > 0:
         # Wheels follow a command closely on any ground.
         of_command = radius if command.reading.form == "sides" else case.command_factors()[0]
-        gain = of_command / float(driven.ahead.gains[0])
+        by, gain = replace(command.reading, explained=driven), of_command / float(driven.ahead.gains[0])
     elif wheels.sign("ahead"):
         gain, share = float(explained.ahead.gains[0]), explained.shares[0]
         turn = float(explained.turned.gains[0]) if wheels.sign("turned") else None
     else:
         return
-    correct_wheel_unit(case, wheels, gain, share, radius, turn)
+    _correct_wheel_unit(case, wheels, by, gain, share, radius, turn)
 
 
-def correct_wheel_unit(
+def _correct_wheel_unit(
     case: Case,
     wheels: Candidate,
+    by: Reading,
     gain: float,
     share: float,
     radius: float | None = None,
@@ -260,11 +276,13 @@ def correct_wheel_unit(
         values |= {"rolled_m": abs(gain), "times": TAKEN_M / abs(gain), "usual_m": TAKEN_M}
     if radius is None and (not unit or unit in RIMS):
         values["taken_m"] = TAKEN_M
+    halves = by.fit_halves("ahead")
     if not unit:
         scale = float(f"{gain / TAKEN_M:.4g}")
-        case.correct(role, "unit of wheels", values, f"scale = {scale:g}", {"scale": scale})
+        case.correct(role, "unit of wheels", values, f"scale = {scale:g}", {"scale": scale}, halves=halves)
     elif unit != "rad/s":
-        case.correct(role, "unit of wheels", values, f'unit = "{unit}"', {"unit": unit}, usual="rad/s")
+        line = f'unit = "{unit}"'
+        case.correct(role, "unit of wheels", values, line, {"unit": unit}, usual="rad/s", halves=halves)
 
 
 def _is_usable(drive: Candidate) -> bool:

@@ -34,6 +34,7 @@ from pipeline.run.signals import (
     ANSWERS_S,
     GROUND_UNOBSERVABLE,
     HORIZON_S,
+    IN_BURSTS,
     LEAST_RIM_SPEED,
     LIVE_SHARE,
     MOVING_MPS,

@@ -12,7 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import ROUNDING_S, Complex, Flags, Floats, Ints, SlipError, arrays, rigid
-from pipeline.run.signals import GROUND_UNOBSERVABLE, DriveSeries, find_fastest_wheel, round_off
+from pipeline.run.signals import GROUND_UNOBSERVABLE, IN_BURSTS, DriveSeries, find_fastest_wheel, round_off
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
 
@@ -161,6 +161,8 @@ class MotionRun:
             if each is new.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.
         is_drive_alone: whether its poses are the motion of its wheels, since none were recorded.
+        in_bursts: whether it stops before the next command, and how long a command acts was found by taking
+            it to be as fast as commanded.
         origin: where its zero lies in the recording, see `anchored`.
     """
 
@@ -179,6 +181,7 @@ class MotionRun:
     repeats_s: float = 0.0
     is_on_course: bool = False
     is_drive_alone: bool = False
+    in_bursts: bool = False
     origin: Origin = Origin()
 
     @property
@@ -311,6 +314,7 @@ def load_run(
         repeats_s=_measure_repeats(tables["poses"]),
         is_on_course=_has_finding(tables.get("findings"), "heading_from_course"),
         is_drive_alone=_has_finding(tables.get("findings"), GROUND_UNOBSERVABLE),
+        in_bursts=_has_finding(tables.get("findings"), IN_BURSTS),
     )
 
 

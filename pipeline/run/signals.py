@@ -34,6 +34,8 @@ _STEPS = 2.0**20
 the rounding of positions in a map."""
 GROUND_UNOBSERVABLE = "ground_unobservable"
 """The finding of a run whose log holds no pose: the motion of its wheels stands in for it."""
+IN_BURSTS = "commands_in_bursts"
+"""The finding of a run whose base stops before its next command, and was taken to be as fast as commanded."""
 STILL = 1e-6
 """[rad/s] of wheels at rest: above the rounding of sums."""
 _OFF_TIE = 0.37

@@ -165,7 +165,7 @@ def tabulate_check(check: RunsCheck) -> Table:
     rows: list[list[str | Cell]] = []
     for one in check.numbers:
         scale, unit = (100.0, " %") if one.is_ratio else (1.0, suffix_unit(one.unit))
-        difference, spread = _explain_unknown(one), ""
+        difference, spread = _explain_unknown(one, is_model=check.sides.is_model), ""
         if one.is_known:
             value, low, high = split_interval(*(scale * part for part in (one.difference, one.low, one.high)))
             difference = f"{'' if value.startswith('-') else '+'}{value}{unit} [{low}, {high}]"
@@ -178,8 +178,10 @@ def tabulate_check(check: RunsCheck) -> Table:
     return Table("Numbers before and after", _HEAD, rows, note).drop_empty()
 
 
-def _explain_unknown(number: CheckedNumber) -> str:
+def _explain_unknown(number: CheckedNumber, *, is_model: bool) -> str:
     """Where and why a number is unknown; empty if it is known."""
+    if is_model and number.name in _WHY_UNKNOWN and not math.isfinite(number.before):
+        return "unknown before: a model file holds no drive"
     ends = (("before", number.before), ("after", number.after))
     sides = [name for name, value in ends if not math.isfinite(value)]
     why = _WHY_UNKNOWN.get(number.name, "the runs do not determine it")

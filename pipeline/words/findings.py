@@ -614,6 +614,19 @@ def _command_scaled(of: Values) -> str:
     return f"the recorded command is {cause}: {seen}; {done}, also for models and exports"
 
 
+def _command_not_scaled(of: Values) -> str:
+    why = "over all of the drive they do not clearly follow a command of that scale better"
+    if "turning" in of:
+        why = (
+            f"in turns their difference is {of['turning']:.2f} times the commanded one (median): no single "
+            "scale fits"
+        )
+    return (
+        f"in slow driving the wheels turn {of['forward']:.2f} times as fast as commanded; {why}: the "
+        "commands are taken as recorded"
+    )
+
+
 def _tape_contradicts(of: Values) -> str:
     radius = f" and a wheel radius of {of['radius_m']:.4g} m" if "radius_m" in of else ""
     return (
@@ -938,6 +951,15 @@ def _configured(of: Values) -> str:
     return f"{fault}, but [{of['where']}] in run.toml gives {given}: correct it"
 
 
+def _contradicted(of: Values) -> str:
+    one, other = of["halves"]
+    return (
+        f"{_fill(FAULTS[of['fault']], of)} by all of the drive, but its halves contradict each other: in the "
+        f"one half the motion is {one:.3g} times the signal, in the other {other:.3g} times. Not corrected "
+        f"({of['line']} under [{of['where']}] in run.toml takes it so)"
+    )
+
+
 def _pose_configured(of: Values) -> str:
     fault, given = _fill(FAULTS[of["fault"]], of), ", ".join(of["given"])
     return f"{fault}, but [pose] in run.toml gives {given}, which is taken as it is given"
@@ -1097,9 +1119,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "wheels_scaled": _wheels_scaled,
     "command_scale": {
         "of the wheels": _command_scaled,
-        "of speeds alone": "in slow driving the wheels turn {forward:.2f} times as fast as commanded, in "
-        "turns their difference is {turning:.2f} times the commanded one (median): no single scale fits, and "
-        "the commands are taken as recorded",
+        "not followed": _command_not_scaled,
         "without a unit": "the numbers of {source} have no sure unit: as they are read, they are multiplied "
         "by {value:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them",
@@ -1144,6 +1164,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         "folder with the same topics name several ({vehicles:and}): none is taken",
         "one": _vehicle_of_folder,
     },
+    "halves_contradict": _contradicted,
     "wheels_corrected": _corrected,
     "imu_corrected": _corrected,
     "pose_turned": _corrected,
@@ -1188,7 +1209,8 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "run.toml name two topics, as of a gyro)",
     "pose_angle": _pose_angle,
     "pose_lever": _pose_lever,
-    "command_timeout": {"held": _command_timeout, "in bursts": _commands_in_bursts},
+    "command_timeout": _command_timeout,
+    "commands_in_bursts": _commands_in_bursts,
     "command_delay": _command_delay,
     "command_late": _command_late,
     "speeds_of_positions": "its speeds are differences of its positions, and scatter as the times between "

@@ -36,3 +36,7 @@ def test_the_ends_differ_from_the_value_as_printed(
     # What is printed is what it was, up to a unit of the last digit, which is no more than the narrower half.
     for shown, exact in ((text, value), (low, value - below), (high, value + above)):
         assert abs(float(shown) - exact) <= 0.51 * uneven * half + 1e-9
+
+
+def test_a_value_that_is_rounding_has_no_more_digits_than_its_interval() -> None:
+    assert split_interval(-4e-16, -32.53, 48.2) == ("0", "-33", "48")

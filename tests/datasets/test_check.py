@@ -176,6 +176,9 @@ def test_what_is_unknown_says_on_which_side_and_why(late: Sides) -> None:
     rows = " ".join(text for label, text in list_check_lines(compare_sides(blind)) if label == "unknown")
     assert "unknown before and after: fewer than 3 stretches of 10 s" in rows
     assert "unknown after: the runs do not determine it" in rows
+    of_model = replace(blind, is_model=True, before=blind.before[:1])
+    rows = " ".join(text for label, text in list_check_lines(compare_sides(of_model)) if label == "unknown")
+    assert "unknown before: a model file holds no drive" in rows
 
 
 def test_one_run_a_side_says_how_many_more_would_tell_and_on_which_ground(late: Sides) -> None:

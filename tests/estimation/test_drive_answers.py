@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,6 +88,15 @@ def test_without_encoders_a_gain_is_the_size_of_the_wheels_or_the_track(name: st
     largest = Largest(1.0, 1.0, 5.0, 3.0, np.linspace(0.0, 60.0, 11))
     assert find_effect(name)().can_show(Conditions(largest, encoders=True))
     assert not find_effect(name)().can_show(Conditions(largest))
+
+
+@pytest.mark.parametrize("name", ["drive_gain", "load_droop", "wheel_radius"])
+def test_of_bursts_that_are_taken_to_be_as_fast_as_commanded_no_gain_is_found(name: str) -> None:
+    largest, effect = Largest(1.0, 1.0, 5.0, 3.0, np.linspace(0.0, 60.0, 11)), find_effect(name)()
+    with_wheels, without = Conditions(largest, encoders=True), Conditions(largest)
+    bursts = [replace(one, bursts=True) for one in (with_wheels, without)]
+    assert effect.can_show(with_wheels)
+    assert [effect.can_show(one) for one in bursts] == [name == "wheel_radius", False]
 
 
 def test_on_level_ground_no_slope_loads_the_wheels() -> None:

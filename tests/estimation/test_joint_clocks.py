@@ -6,16 +6,18 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Diagnosis, EstimationData, Input, carry_over, diagnose_runs, load_recording
+from pipeline.estimation.ambiguity import read_clocks
 from pipeline.estimation.ladder import assess_model
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.models import Number, read_model, write_model
+from pipeline.models import Number, Timing, find_effect, read_model, write_model
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -114,3 +116,18 @@ def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: P
     for runs, clocks in (([blind], ()), ([run, run], ()), ([run, blind], ("clock_offset",))):
         data = EstimationData(runs, vehicle, Input.COMMAND)
         assert all(path.clocks == clocks for path in data.paths)
+
+
+@pytest.mark.parametrize("named", [("clock_offset",), ()], ids=["proven", "not proven"])
+def test_a_heading_is_said_to_be_old_where_the_search_named_it(named: tuple[str, ...]) -> None:
+    """A clock that stays in a model without a name was named whatever its size."""
+    clock = find_effect("clock_offset")(d=-0.05)
+    state = SimpleNamespace(effects=(clock,), effects_of=lambda _: (clock,), timing=(Timing(),))
+    alignment = SimpleNamespace(heading_delay_s=0.0)
+    run = SimpleNamespace(alignment=alignment, gyro_fit=SimpleNamespace(delay_error_s=0.001))
+    data = SimpleNamespace(runs=(run,), has_gyro=True, largest=SimpleNamespace(moves_both_ways=True))
+    outcome = SimpleNamespace(
+        final=SimpleNamespace(state=state), new=named, start=SimpleNamespace(ids=frozenset())
+    )
+    clocks = read_clocks(cast("Any", data), cast("Any", outcome), Input.COMMAND)
+    assert [one.id for one in clocks.effects] == (["heading_skew"] if named else [])

@@ -127,7 +127,7 @@ def test_gaps_are_numbered_by_the_period() -> None:
 def test_a_base_that_stops_before_its_next_command_drives_in_bursts(hold_s: float, tmp_path: Path) -> None:
     robot = make_robot(4, hold_s=hold_s, period_s=0.5)
     setup, told = set_up(tmp_path / "log.mcap", robot.command(), robot.pose())
-    assert "in bursts" in told["command_timeout"]
+    assert "in bursts" in told["commands_in_bursts"]
     assert setup.configuration.command.hold_s == pytest.approx(hold_s, abs=0.015)
 
 

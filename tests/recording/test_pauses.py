@@ -7,7 +7,7 @@ from few import few
 from pipeline.core import Floats
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.readings import Held, Reading
-from pipeline.recording.timeouts import CommandTimeout, find_hold, find_timeout
+from pipeline.recording.timeouts import CommandTimeout, find_hold, find_timeout, hold
 
 TIMEOUT_S = 0.5
 STEP_S = 0.02
@@ -117,3 +117,14 @@ def test_a_base_that_waits_less_than_its_commander_drives_in_bursts(
         return
     assert found.low <= timeout_s <= found.high
     assert found.seconds == pytest.approx(timeout_s, abs=0.05)
+
+
+@pytest.mark.parametrize("timeout_s", [0.6, 1.2, 5.0], ids=str)
+def test_a_message_counts_whatever_silence_ends_with_it(timeout_s: float) -> None:
+    """Gaps of whole periods are a little longer or shorter than these by rounding."""
+    stamps = np.delete(1.2 * np.arange(400), np.arange(50, 350, 7))
+    values = np.random.default_rng(8).uniform(0.5, 1.0, stamps.size)
+    command = Reading("body", "", Held(stamps, values, may_stand=True), Held(stamps, 0.0 * values))
+    held = hold(command, timeout_s).first
+    at = np.searchsorted(held.times, stamps + 1e-9, side="right") - 1
+    assert np.array_equal(held.values[at], values)

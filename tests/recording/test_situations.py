@@ -367,3 +367,29 @@ def test_a_tape_that_contradicts_the_vehicle_offers_no_length(samples: Path, tmp
     assert "wheel_radius_m" not in found.values
     said = format_finding(found)
     assert re.search(r"contradicts the .*Husky.* times as far in this log\. No length is taken", said), said
+
+
+@pytest.mark.parametrize("spoilt", ["command", "wheels"])
+def test_a_correction_that_one_half_of_a_drive_denies_is_not_applied(spoilt: str, tmp_path: Path) -> None:
+    drive = draw(51)
+    late = drive.time > np.quantile(drive.time, 0.55)
+    asked, wheels = drive.asked, sides(drive)
+    if spoilt == "command":
+        asked = drive.asked * np.where(late, 1e3, 1.0)[:, None]
+    else:
+        left = np.where(np.interp(wheels.first.times, drive.time, late) > 0.0, 2.5, 1.0)
+        wheels = replace(wheels, first=Held(wheels.first.times, left * wheels.first.values))
+    setup = set_up_log(
+        write_log(tmp_path / "log.mcap", drive, wheels=wheels, asked=asked), Options(out=tmp_path)
+    )
+    told = " ".join(format_finding(one) for one in setup.choice.findings)
+    assert setup.configuration.wheels.factors is None
+    assert setup.configuration.command.unit is None
+    assert ("its halves contradict each other" in told) == (spoilt == "command")
+
+
+def test_what_is_rounding_ahead_of_a_base_that_moves_to_its_side_says_nothing() -> None:
+    times = np.arange(0.0, 30.0, 0.1)
+    ahead = Held(times, np.full(times.size, 4e-9), may_stand=True)
+    assert not ahead.moves
+    assert Held(times, np.full(times.size, 0.1), may_stand=True).moves

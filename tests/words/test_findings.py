@@ -42,7 +42,7 @@ HELPERS = {
     }
 }
 """Functions that make values of findings elsewhere than at their sites, by the module of these."""
-OF_FAULTS = (words._corrected, words._configured, words._pose_configured)
+OF_FAULTS = (words._corrected, words._configured, words._pose_configured, words._contradicted)
 """Templates with that of a fault in them, whose values are those of the fault."""
 
 

@@ -7,7 +7,7 @@ Gains come first in the drive: ramps and limits behind them are those of the mea
 Source: steady state of a proportional speed controller; Astrom and Murray, Feedback Systems, chapter 10.
 """
 
-from pipeline.models.families import Excitation, Least, Parameter, Plausible, declare, has_encoders
+from pipeline.models.families import Excitation, Least, Parameter, Plausible, declare, has_timed_encoders
 
 SHARE = Parameter(
     "g",
@@ -29,5 +29,5 @@ DriveGain = declare(
     SHARE,
     scale_role="gain",
     needs=(Excitation.SPEED_SPREAD,),
-    can_show=has_encoders,
+    can_show=has_timed_encoders,
 )

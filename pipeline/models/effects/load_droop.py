@@ -17,7 +17,7 @@ from pipeline.models.families import (
     Parameter,
     Plausible,
     declare,
-    has_encoders,
+    has_timed_encoders,
 )
 
 LoadDroop = declare(
@@ -38,5 +38,5 @@ LoadDroop = declare(
     rank=12,
     kinds=ANY,
     needs=(Excitation.SPEED_SPREAD,),
-    can_show=has_encoders,
+    can_show=has_timed_encoders,
 )

@@ -15,6 +15,7 @@ from pipeline.models.families import (
     Quantity,
     Spread,
     declare,
+    has_speed,
 )
 
 WheelRadius = declare(
@@ -40,6 +41,7 @@ WheelRadius = declare(
     scale_role="radius",
     rank=30,
     needs=(Excitation.SPEED_SPREAD,),
+    can_show=has_speed,
     readings=(
         Meaning(Level.VEHICLE, "wheel_radius", "a wrong wheel radius"),
         Meaning(Level.TERRAIN, "longitudinal_slip", "longitudinal slip"),
