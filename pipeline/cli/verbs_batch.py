@@ -182,6 +182,6 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
         (line.path, f"earlier results, {line.replaced}", "") for line in outcome.lines if line.replaced
     ]
     lines += explain_logs("replaced", replaced[:_MOST_REPLACED])
-    more = len(replaced) - _MOST_REPLACED
-    lines += [f"  and {more} more (--json lists them)"] if more > 0 else []
+    others = len(replaced) - _MOST_REPLACED
+    lines += [f"  and {others} more (--json lists them)"] if others > 0 else []
     return lines

@@ -260,17 +260,17 @@ def find_existing(paths: Iterable[str], patience_s: float) -> dict[str, bool | s
         paths: files and folders.
         patience_s: how long to wait for an answer [s], once for each mount that does not answer.
     """
-    found: dict[str, bool | str] = {}
+    answers: dict[str, bool | str] = {}
     answered: set[Path] = set()
     silent: set[Path] = set()
 
     def look(path: Path, asked: list[Path]) -> None:
         # From the top: the first folder without an answer is the mount, and what is below it is not asked.
-        for place in (*reversed(path.parents), path):
-            if place not in answered:
-                asked.append(place)
-                place.stat()
-                answered.add(place)
+        for part in (*reversed(path.parents), path):
+            if part not in answered:
+                asked.append(part)
+                part.stat()
+                answered.add(part)
 
     for text in paths:
         path, asked = Path(text), list[Path]()
@@ -281,13 +281,13 @@ def find_existing(paths: Iterable[str], patience_s: float) -> dict[str, bool | s
                 silent.add(asked[-1])
             except OSError as error:
                 gone = error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
-                found[text] = False if gone else f"it cannot be read ({error.strerror or error})"
+                answers[text] = False if gone else f"it cannot be read ({error.strerror or error})"
             except ValueError:
-                found[text] = False
+                answers[text] = False
             else:
-                found[text] = True
-        found.setdefault(text, describe_silence(patience_s))
-    return found
+                answers[text] = True
+        answers.setdefault(text, describe_silence(patience_s))
+    return answers
 
 
 def walk_tree(
