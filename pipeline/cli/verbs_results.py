@@ -160,7 +160,7 @@ def status(  # noqa: D417 - arguments document themselves
     folder = open_results(results)
     if run is not None:
         manifest = store.find_run(run, folder)
-        writer = folder.list_writers().get(manifest.home.relative_to(folder.root / store.RUNS).as_posix(), "")
+        writer = folder.find_writer(manifest)
         content = {"run": manifest.run, "key": manifest.key, "writing": writer, **manifest.details}
         return print_result(content, lambda: _format_origin(manifest, writer), json=json)
     status_now = read_status(folder)

@@ -141,6 +141,10 @@ class Store:
         held = ((path.parent.relative_to(top).as_posix(), find_holder(path)) for path in locks)
         return {name: holder for name, holder in held if holder}
 
+    def find_writer(self, manifest: Manifest) -> str:
+        """Who writes new results of a run now; empty where nobody does."""
+        return find_holder(manifest.home / LOCK)
+
     @contextmanager
     def open_generation(self, run: str, key: str) -> Iterator[Generation]:
         """Begin new results of a run, alone; without a commit nothing of them remains.

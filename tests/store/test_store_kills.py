@@ -296,6 +296,10 @@ def test_waiting_ends_with_the_name_of_the_holder_and_death_releases(
         assert store.list_writers() == {}
         # A child that outlives a killed writer does not keep its lock.
         write_generation(hasty, RUN, "new", 1)
+        manifest = store.manifest(RUN)
+        assert store.find_writer(manifest) == ""
+        with hold_lock(manifest.home / ".lock", patience_s=0.0):
+            assert [store.find_writer(manifest)] == [*store.list_writers().values()]
     finally:
         if child:
             os.kill(child, signal.SIGKILL)
