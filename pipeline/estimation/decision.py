@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +33,7 @@ from pipeline.estimation.matrix import Matrix, Move
 from pipeline.estimation.model_state import combine_columns, pick_columns
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.plausibility import is_nameable, is_possible, is_too_small
+from pipeline.models import Least
 from pipeline.models import Search as HowSearched
 
 if TYPE_CHECKING:
@@ -203,17 +204,15 @@ class Search:
 
     def run(self, start: ModelState) -> SearchResult:
         """Search from a model."""
-        first = fit_path(self.path, start)
-        final, judged = self.name_all(self.search_possible(first))
-        matrix = self.make_matrix(final)
-        rivals = list(self._list_rivals(final, matrix, judged))
-        for _ in range(_BETTER):
+        first = start_from = fit_path(self.path, start)
+        for _ in range(1 + _BETTER):
+            final, judged = self.name_all(self.search_possible(start_from))
+            matrix = self.make_matrix(final)
+            judged, rivals = self._find_rivals(final, matrix, judged)
             better = min(rivals, key=lambda one: one.behind, default=None)
             if better is None or better.behind > -EQUAL or self.budget.is_spent():
                 break
-            final, judged = self.name_all(self.search_possible(better.fit))
-            matrix = self.make_matrix(final)
-            rivals = list(self._list_rivals(final, matrix, judged))
+            start_from = better.fit
         named = tuple(name for name, one in judged.items() if not one.refusal)
         return SearchResult(first, final, named, judged, tuple(rivals), matrix)
 
@@ -243,6 +242,11 @@ class Search:
     def _is_small(self, fit: PathFit, effect: Effect) -> bool:
         """Whether only its size keeps an effect from a name: it stays, as others would only imitate it."""
         return all(is_too_small(one, self.conditions) for one in _list_acting(fit, effect))
+
+    def _is_within_tolerance(self, fit: PathFit, effect: Effect) -> bool:
+        """Whether only the tolerance of data sheets keeps an effect of a model from a name."""
+        reasons = {p.least.reason for p in effect.parameters if p.least is not None}
+        return effect.id not in self.given and reasons == {Least.DATA_SHEET} and self._is_small(fit, effect)
 
     def _climb(self, current: PathFit) -> PathFit:
         """The model improved until nothing is cheaper."""
@@ -495,34 +499,52 @@ class Search:
         matrix = Matrix(fit, (), self.conditions.largest)
         return {one.id: judge(fit, one, matrix, self.conditions, self.least_t) for one in asked}
 
-    def _list_rivals(
-        self, final: PathFit, matrix: Matrix, judged: dict[str, Judged]
-    ) -> Iterator[Alternative]:
-        """Effects as good as one that is named, or better in a tenth of resampled recordings."""
+    def _find_rivals(
+        self, final: PathFit, matrix: Matrix, judged: Mapping[str, Judged]
+    ) -> tuple[dict[str, Judged], list[Alternative]]:
+        """How effects were judged, and what the data do not separate from those with a name.
+
+        What is within the tolerance of data sheets as one effect may be beyond it as another: on circles one
+        way round the wheels of one side are .3 % larger, or the track is 1.5 % wider. Such a one has a name.
+        """
+        rivals = {
+            name: list(self._list_rivals(final, matrix, name))
+            for name, one in judged.items()
+            if not one.refusal
+        }
+        own, judged = Matrix(final, (), self.conditions.largest), dict(judged)
+        for effect in final.state.effects:
+            if effect.id in judged or not self._is_within_tolerance(final, effect):
+                continue
+            one = judge(final, effect, own, self.conditions, self.least_t, whatever_size=True)
+            others = [] if one.refusal else list(self._list_rivals(final, matrix, effect.id))
+            if others:
+                judged[effect.id], rivals[effect.id] = one, others
+        return judged, [*chain.from_iterable(rivals.values())]
+
+    def _list_rivals(self, final: PathFit, matrix: Matrix, name: str) -> Iterator[Alternative]:
+        """Effects as good as one of a model, or better in a tenth of resampled recordings."""
         own = _sum_blocks(final, final.noise)
         weights = _resample(own.size)
-        for name in (name for name, one in judged.items() if not one.refusal):
-            brings = matrix.expect_change(Move().drop(name))
-            others = [
-                one
-                for one in matrix.list_replacements(name)
-                if matrix.expect_change(one) < _PROMISING * brings
-            ]
-            for change in others[:_RIVALS]:
-                _, _, state = self._look(matrix, change)
-                fit = _fit_under(self.path, state, final.noise, _STEPS, find_cost(final) + _FAR)
-                (other,) = (matrix.trials[index].effect.id for index in change.added)
-                effect = fit.state.find(other)
-                if effect is None or not any(
-                    is_nameable(one, self.conditions) for one in _list_acting(fit, effect)
-                ):
-                    continue
-                behind = _sum_blocks(fit, final.noise) - own
-                price = _find_price(fit.state, fit.numbers) - _find_price(final.state, final.numbers)
-                apart = find_cost(fit) - find_cost(final)
-                is_often = float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN
-                if apart < EQUAL or (is_often and apart < _FAR):
-                    yield Alternative(name, other, fit, apart)
+        brings = matrix.expect_change(Move().drop(name))
+        others = [
+            one for one in matrix.list_replacements(name) if matrix.expect_change(one) < _PROMISING * brings
+        ]
+        for change in others[:_RIVALS]:
+            _, _, state = self._look(matrix, change)
+            fit = _fit_under(self.path, state, final.noise, _STEPS, find_cost(final) + _FAR)
+            (other,) = (matrix.trials[index].effect.id for index in change.added)
+            effect = fit.state.find(other)
+            if effect is None or not any(
+                is_nameable(one, self.conditions) for one in _list_acting(fit, effect)
+            ):
+                continue
+            behind = _sum_blocks(fit, final.noise) - own
+            price = _find_price(fit.state, fit.numbers) - _find_price(final.state, final.numbers)
+            apart = find_cost(fit) - find_cost(final)
+            is_often = float(np.mean(weights @ behind + price < 0.0)) >= _OFTEN
+            if apart < EQUAL or (is_often and apart < _FAR):
+                yield Alternative(name, other, fit, apart)
 
 
 def _fit_under(
@@ -595,7 +617,13 @@ def measure_t(
 
 
 def judge(
-    fit: PathFit, effect: Effect, matrix: Matrix, conditions: Conditions, least_t: float = LEAST_T
+    fit: PathFit,
+    effect: Effect,
+    matrix: Matrix,
+    conditions: Conditions,
+    least_t: float = LEAST_T,
+    *,
+    whatever_size: bool = False,
 ) -> Judged:
     """Give an effect of a model its name, or say why not.
 
@@ -605,6 +633,7 @@ def judge(
         matrix: of the model.
         conditions: what the runs can show.
         least_t: standard errors that it must be from none.
+        whatever_size: whether it may be smaller than data sheets and stamps err.
     """
     path, (base, is_linear) = fit.path, _drop_effect(fit, effect.id, matrix.without[effect.id])
     if is_linear:
@@ -622,7 +651,10 @@ def judge(
     refusal, is_proven, acting = "", False, _list_acting(fit, effect)
     if t < least_t:
         refusal = f"it is not significant: t = {t:.1f}, required {least_t:.2g}"
-    elif not any(is_possible(fit, one, conditions) for one in acting):
+    elif not any(
+        is_possible(fit, one, conditions) or (whatever_size and is_too_small(one, conditions))
+        for one in acting
+    ):
         is_small = all(is_too_small(one, conditions) for one in acting)
         refusal = (
             "it is smaller than data sheets and stamps err" if is_small else "its values are not possible"

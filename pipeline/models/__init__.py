@@ -109,6 +109,7 @@ else:
                 "Conditions",
                 "Excitation",
                 "Largest",
+                "Least",
                 "Level",
                 "Parameter",
                 "Quantity",
