@@ -204,15 +204,15 @@ class Search:
 
     def run(self, start: ModelState) -> SearchResult:
         """Search from a model."""
-        first = start_from = fit_path(self.path, start)
+        first = begin = fit_path(self.path, start)
         for _ in range(1 + _BETTER):
-            final, judged = self.name_all(self.search_possible(start_from))
+            final, judged = self.name_all(self.search_possible(begin))
             matrix = self.make_matrix(final)
             judged, rivals = self._find_rivals(final, matrix, judged)
             better = min(rivals, key=lambda one: one.behind, default=None)
             if better is None or better.behind > -EQUAL or self.budget.is_spent():
                 break
-            start_from = better.fit
+            begin = better.fit
         named = tuple(name for name, one in judged.items() if not one.refusal)
         return SearchResult(first, final, named, judged, tuple(rivals), matrix)
 
@@ -512,10 +512,11 @@ class Search:
             for name, one in judged.items()
             if not one.refusal
         }
-        own, judged = Matrix(final, (), self.conditions.largest), dict(judged)
+        judged = dict(judged)
         for effect in final.state.effects:
             if effect.id in judged or not self._is_within_tolerance(final, effect):
                 continue
+            own = Matrix(final, (), self.conditions.largest)
             one = judge(final, effect, own, self.conditions, self.least_t, whatever_size=True)
             others = [] if one.refusal else list(self._list_rivals(final, matrix, effect.id))
             if others:
