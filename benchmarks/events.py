@@ -1,7 +1,7 @@
 """Events in motion: what is found of injected ones, how early, and false alarms on recordings.
 
-Injected are digging in, spinning wheels (in the air, too: they bring nothing), sliding, emergency stops and
-take-overs, on vehicles that drive as drawn. Found is an event that begins within a second of the truth;
+Injected are digging in, spinning wheels (in the air, too: they bring nothing), sliding, stops under commands
+and take-overs, on vehicles that drive as drawn. Found is an event that begins within a second of the truth;
 the lead is the time from the first alarm of digging in until the vehicle stands.
 """
 
@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 from incidents import Incident, IncidentKind, simulate_incidents
 
 KINDS: tuple[IncidentKind, ...] = (
-    "digging_in", "stuck", "spinning", "sliding", "emergency_stop", "manual_driving",
+    "digging_in", "stuck", "spinning", "sliding", "stopped", "manual_driving",
 )  # fmt: skip
 LOST = {"stuck", "spinning", "digging_in"}
 FOUND_AS = dict.fromkeys(LOST, LOST)
@@ -43,7 +43,7 @@ WITHIN_S = 1.0
 LEADS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 KNOWN = {
     ("husky_snow_boreal", "stuck"): 2,
-    ("warthog_wheels_asphalt_2024_9_20_8h13s12", "emergency_stop"): 1,
+    ("warthog_wheels_asphalt_2024_9_20_8h13s12", "stopped"): 1,
     ("warthog_wheels_sand_2024_9_25_14h32s32", "manual_driving"): 1,
 }
 """Events of the recordings that were looked at one by one, and are none of false alarms."""
@@ -79,7 +79,7 @@ def find_event(scenario: Scenario, incident: Incident, scratch: Path) -> dict[st
     drive, step = made.truth.drive, made.truth.drive.step_s
     radius = scenario.vehicle.wheel_radius_m
     wanted = slice(int((incident.start_s - 2.0) / step), int((incident.start_s + 4.0) / step))
-    if incident.kind in {"emergency_stop", "sliding"}:
+    if incident.kind in {"stopped", "sliding"}:
         wanted = slice(wanted.start, int(incident.start_s / step))
     left, right = radius * drive.left[wanted], radius * drive.right[wanted]
     ahead, turning = 0.5 * (left + right), 0.5 * np.abs(right - left)

@@ -154,7 +154,7 @@ class Alignments(Table):
 
 
 EVENT_KINDS = (
-    "digging_in", "spinning", "stuck", "sliding", "emergency_stop", "manual_driving", "pushed",
+    "digging_in", "spinning", "stuck", "sliding", "stopped", "side_stopped", "manual_driving", "pushed",
     "commands_silent", "localization_frozen",
 )  # fmt: skip
 
@@ -162,7 +162,7 @@ EVENT_KINDS = (
 class Events(Table):
     """One row an event in motion, from commands, wheels and poses."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     kind = schemas.choice(EVENT_KINDS, "what happened")
     t_start = schemas.seconds("when it began")

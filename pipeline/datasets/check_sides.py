@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.core import INPUTS, NORMAL_95, SlipError
 from pipeline.datasets.check_readings import Label, RunReading, list_labels, measure_slip, read_run
 from pipeline.datasets.compared_runs import find_run_refusal, read_digest
+from pipeline.datasets.corrections import note_corrections
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.run_residuals import Input, choose_input
@@ -128,7 +129,7 @@ def read_sides(
         both,
         before=known[0],
         after=known[1],
-        notes=(*notes_before, *notes_after, *both.notes),
+        notes=(*notes_before, *notes_after, *note_corrections(store, everything), *both.notes),
         others=_read_others(others, both, store),
     )
 

@@ -35,6 +35,7 @@ from pipeline.datasets.pairs import (
 )
 from pipeline.datasets.pooling import pool_runs
 from pipeline.datasets.published_chain import follow_published, read_limits
+from pipeline.results import read_finding_table
 from pipeline.store import ANALYZE_FIRST, Store, lack_runs
 from schemas import contract_of
 
@@ -49,6 +50,8 @@ ABOUT_UNIT = (
 _FEWEST = 2
 _HASH = 64
 """Characters of a SHA-256 in hexadecimal."""
+_APPLIED = ("of the wheels", "without a unit")
+"""Kinds of the finding `command_scale` with which commands are multiplied."""
 _NORMS = ("windows", "t_start", "window_norm")
 """Table and columns of the 2 s window norms."""
 Bounds = dict[tuple[str, str], tuple[float, float]]
@@ -178,13 +181,13 @@ class _Comparison:
         """Window norms of the published processing chain for every run that it applies to."""
         samples: dict[str, SlipSamples] = {}
         self.notes.append(ABOUT_UNIT)
+        scaled_runs = _find_scaled(self.compared)
         for run, manifest in self.compared.manifests.items():
-            findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
             followed = follow_published(
                 manifest.read("slip"),
                 manifest.read("poses"),
                 limits=read_limits(manifest.part("vehicle")),
-                command_is_scaled="command_scale" in findings,
+                command_is_scaled=run in scaled_runs,
             )
             if followed is None:
                 continue
@@ -342,10 +345,19 @@ def _find_families(
     return families
 
 
+def _find_scaled(compared: ComparedRuns) -> list[str]:
+    """Runs whose recorded command was multiplied by a scale; one that is only told changes no command."""
+    rows = compared.scan("findings").filter(pl.col("id") == "command_scale").collect()
+    return sorted(
+        str(run)
+        for (run,), part in rows.partition_by("run", as_dict=True).items()
+        if any(one.values.get("kind") in _APPLIED for one in read_finding_table(part))
+    )
+
+
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
     """Warn of runs whose recorded command was rescaled: their slip from commands rests on an estimate."""
-    doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
-    runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
+    runs = _find_scaled(compared)
     text = "read with care, the recorded command had another scale, which was estimated and corrected"
     return [f"{text} (--input measured does without): {', '.join(runs)}"] if runs else []
 

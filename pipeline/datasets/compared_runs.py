@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import group_by, guess_names, name_first
+from pipeline.datasets.corrections import note_corrections
 from pipeline.datasets.pooling import (
     ComparisonError,
     add_measures,
@@ -45,7 +46,7 @@ class ComparedRuns:
         labels: one row per run: labels, ``key``, ``group``, ``mass`` [kg], ``squared_gyration`` [m^2].
         manifests: their generations by run.
         store: the results.
-        notes: excluded runs with the reasons.
+        notes: runs of one vehicle that were corrected in different ways, and excluded runs with the reasons.
         refusals: reasons why slip is not observable, by run.
         date_notes: contradictory dates, and runs whose order is not known.
         total: number of runs that could count: all of the results, or those that were asked for.
@@ -97,7 +98,8 @@ def find_material(
     Excluded with a note are runs with a damaged table, whichever it is, duplicates of a recording, tables
     of another contract version, runs without a group, and runs without a pose, whose slip is that of the
     wheels against their commands; with ``trusted_only`` also runs with a finding
-    that forbids conclusions. Simulated runs are left out where there are recordings.
+    that forbids conclusions. Simulated runs are left out where there are recordings. With ``trusted_only``
+    the first notes are on runs of one vehicle that were corrected in different ways.
 
     Args:
         store: the results.
@@ -153,10 +155,13 @@ def find_material(
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
     compared = _leave_out_untrusted(compared) if trusted_only else compared
     simulated = [run for run, manifest in compared.manifests.items() if manifest.details.get("simulated")]
-    if len(simulated) == len(compared.manifests):
+    if len(simulated) < len(compared.manifests):
+        reason = "simulated, and never pooled with recordings"
+        compared = _leave_out(compared, pl.col("run").is_in(simulated), reason)
+    if not trusted_only:
         return compared
-    reason = "simulated, and never pooled with recordings"
-    return _leave_out(compared, pl.col("run").is_in(simulated), reason)
+    notes = note_corrections(store, compared.manifests.values())
+    return replace(compared, notes=(*notes, *compared.notes))
 
 
 def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> ComparedRuns:

@@ -78,8 +78,8 @@ def follow_published(
     - u: the body command, clipped, through a first-order lag with one time constant for both wheels, over the
       whole command step, starting from the measured wheel speeds. The time constant minimizes the mean
       absolute error between the lagged command and the measured wheels of the run (0.05 to 3 s).
-    - If the log's command is known to be scaled wrongly (finding `command_scale`), forward speed and yaw
-      rate are first multiplied by their measured ratios in slow steady steps.
+    - If the log's command was scaled wrongly and is corrected (finding `command_scale`), forward speed and
+      yaw rate are first multiplied by their measured ratios in slow steady steps.
     - v: x, y and yaw of the poses as recorded, held ones too, at 20 Hz; per window of 40 samples a smoothing
       spline with lambda 0.8 over t from 0 to 2 s; forward differences, rotated by the smoothed heading at
       their start, the last value repeated.
@@ -89,7 +89,7 @@ def follow_published(
         slip: table `slip` of the run, both inputs.
         poses: table `poses` of the run.
         limits: limits of the vehicle's body command.
-        command_is_scaled: whether the run has the finding `command_scale`.
+        command_is_scaled: whether the command was scaled wrongly and is corrected.
 
     Returns:
         None if the run has no command, no measured wheels, no whole window, or a rate other than 20 Hz.

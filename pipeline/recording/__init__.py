@@ -15,6 +15,7 @@ from pipeline.core import INPUTS, SlipError
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
+    from pipeline.recording.case import *
     from pipeline.recording.clocks import *
     from pipeline.recording.drive import *
     from pipeline.recording.echo import *
@@ -32,6 +33,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
+            "case": ("are_apart",),
             "clocks": ("find_pauses",),
             "drive": ("SIGNALS", "interpolate_readings"),
             "echo": ("check_echo",),

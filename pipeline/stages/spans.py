@@ -30,22 +30,13 @@ from pipeline.recording import BLOCK_S, LASTS_NATS, Finding, follow_likeliest, p
 from pipeline.run import ANSWERS_S, LIVE_SHARE, STILL_MPS
 from pipeline.sources import Vehicle
 from pipeline.stages.inputs import Ideal
+from schemas.run_tables import EVENT_KINDS
 
 Kind = Literal[
-    "emergency_stop", "side_stopped", "manual_driving", "pushed", "commands_silent", "stuck",
+    "stopped", "side_stopped", "manual_driving", "pushed", "commands_silent", "stuck",
     "localization_frozen", "rotated", "lost", "outlier",
 ]  # fmt: skip
 
-_INCIDENTS = {
-    "emergency_stop",
-    "side_stopped",
-    "manual_driving",
-    "pushed",
-    "commands_silent",
-    "stuck",
-    "localization_frozen",
-}
-"""Kinds of spans that are no fault of the poses."""
 _BAD_POSES = ("rotated", "lost")
 
 LIVE = 0.25
@@ -196,8 +187,8 @@ def find_spans(
     if rims.driven is not None:
         spans += _compare_wheels(rims, blocks, poses)
     spans.sort(key=lambda one: one.start)
-    incidents = tuple(one for one in spans if one.kind in _INCIDENTS)
-    bad = [one for one in spans if one.kind not in _INCIDENTS]
+    incidents = tuple(one for one in spans if one.kind in EVENT_KINDS)
+    bad = [one for one in spans if one.kind not in EVENT_KINDS]
     wrong = mark_spans(times, bad)
     if bad:
         findings.append(_report_poses(bad, wrong, rims))
@@ -464,7 +455,7 @@ def _compare_command(
     has_sides = rims.driven is not None and vehicle.kinematics.has_inputs("left", "right")
     for one in _list_contradictions(blocks, fit, asked, has_sides=has_sides):
         if one.motion == "stands" and one.is_driven:
-            spans.append(Span("emergency_stop", one.start, one.end, one.nats))
+            spans.append(Span("stopped", one.start, one.end, one.nats))
         elif one.motion == "stands on one side" and one.is_driven:
             spans.append(Span("side_stopped", one.start, one.end, one.nats))
         elif not one.is_driven:

@@ -497,8 +497,8 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "kept_command": "in {count} pauses the vehicle continues its last command until the next, for up to "
     "{value:.1f} s beyond command.hold_s: the base holds its last command; set command.hold_s to the longest "
     "pause to include these stretches",
-    "emergency_stop": "the vehicle stood still under live commands: an emergency stop, the drive was off, or "
-    "it was too weak to move; left out of all fits",
+    "stopped": "the vehicle stood still under live commands: an emergency stop, or a drive that was off, "
+    "blocked or too weak to move it; left out of all fits",
     "side_stopped": "the wheels of one side stood under live commands: one was stuck, or its motor off; left "
     "out of all fits",
     "manual_driving": "the vehicle moved without a command: by joystick, another controller, or a push; left "

@@ -13,6 +13,7 @@ from pipeline.datasets.compare import Answer, compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pairs import Group, SlipSamples, compare_groups
+from pipeline.recording import Finding
 from pipeline.report.datasets_page import _draw_levels, write_answer
 from pipeline.store import Store
 
@@ -109,6 +110,19 @@ def test_grave_findings_copies_and_other_scales_are_left_out_and_said(store: Sto
     assert "not pooled: somewhere" in told
     command = answer.datasets.filter(pl.col("input") == "command")
     assert command["runs"].to_list() == [4, 4]
+
+
+def test_a_scale_of_commands_that_is_told_and_not_applied_changes_no_comparison(store: Store) -> None:
+    for kind in ("of the wheels", "without a unit", "not followed"):
+        scale = Finding("command_scale", "warning", "command", {"kind": kind, "value": 2.0})
+        write_run(store, Run(name=kind.replace(" ", "_"), noted=[scale], driven=2.0))
+    (note,) = (note for note in ask(store).notes if "another scale" in note)
+    assert note.endswith(": of_the_wheels, without_a_unit")
+    notes = [note for note in ask(store, as_published=True).notes if note.startswith("published chain")]
+    assert len(notes) == 3
+    assert [note for note in notes if "command scaled by 2.00 forward" not in note] == [
+        note for note in notes if "not_followed" in note
+    ]
 
 
 def test_a_damaged_run_costs_itself_only(store: Store) -> None:

@@ -97,7 +97,7 @@ def watch(made: SimulatedRun, incident: Incident) -> Case:
     driven = vehicle.wheel_radius_m * np.maximum(np.abs(drive.left[cell]), np.abs(drive.right[cell]))
     if incident.kind == "commands_silent":
         return Case(made, incident, begin, end if told[0] > 2.0 * VISIBLE_MPS else begin)
-    shows = {"pushed": driven < STANDS_MPS, "emergency_stop": told > VISIBLE_MPS}.get(
+    shows = {"pushed": driven < STANDS_MPS, "stopped": told > VISIBLE_MPS}.get(
         incident.kind, driven > VISIBLE_MPS
     )
     pieces = [at[a:b] for a, b in find_runs(shows) if (b - a) * 0.05 >= PIECE_S]
@@ -212,7 +212,7 @@ def test_an_incident_does_not_move_what_is_fitted(kind: IncidentKind) -> None:
 
 
 def test_the_fit_goes_on_without_the_seconds_of_an_incident() -> None:
-    made = simulate_incidents(make_scenario(TRUTH), Incident("emergency_stop", 40.0, 60.0))
+    made = simulate_incidents(make_scenario(TRUTH), Incident("stopped", 40.0, 60.0))
     run = load_run(tables_of(made, HUSKY), HUSKY, name="stopped")
     middles = EstimationData([run], HUSKY, Input.COMMAND).whole.times.mean(axis=1)
     assert not ((middles > 41.0) & (middles < 60.0)).any()
@@ -242,7 +242,7 @@ def test_an_incident_of_a_log_stands_in_its_findings_its_slip_and_its_report(tmp
 # stands under commands on asphalt, and is driven by hand until its commands begin on sand.
 KNOWN = {
     ("husky_snow_boreal", "stuck"): 5,
-    ("warthog_wheels_asphalt_2024_9_20_8h13s12", "emergency_stop"): 1,
+    ("warthog_wheels_asphalt_2024_9_20_8h13s12", "stopped"): 1,
     ("warthog_wheels_sand_2024_9_25_14h32s32", "manual_driving"): 1,
 }
 

@@ -7,6 +7,7 @@ import pytest
 from pipeline.core.arrays import Flags, Floats
 from pipeline.sources import find_preset
 from pipeline.stages.inputs import Ideal
+from pipeline.stages.motion_events import find_events
 from pipeline.stages.spans import find_spans
 
 STEP_S = 0.05
@@ -34,7 +35,7 @@ def test_a_driver_who_hesitates_under_a_stop_does_not_hide_it(period_s: float, l
     ((kind, start, end),) = find(
         np.where(times % period_s < live_s, 0.5, 0.15), (times >= 50.0) & (times < 58.0)
     )
-    assert kind == "emergency_stop"
+    assert kind == "stopped"
     assert abs(start - 50.0) < 1.0
     assert abs(end - 58.0) < 1.0
 
@@ -52,7 +53,7 @@ def test_segments_that_overlap_where_the_poses_jump_hide_no_stop() -> None:
     ((kind, start, end),) = find(
         np.where(twice % 1.9 < 1.5, 0.5, 0.15), (twice >= 50.0) & (twice < 58.0), twice
     )
-    assert kind == "emergency_stop"
+    assert kind == "stopped"
     assert abs(start - 50.0) < 1.0
     assert abs(end - 58.0) < 1.0
 
@@ -71,9 +72,14 @@ def test_a_side_that_stands_while_the_other_one_follows_is_told_and_left_out(sid
     driven = np.where(stuck[:, None], np.column_stack((rim, 0.0 * rim, -side * rim / half)), asked)
     flags = np.zeros(times.size, dtype=bool)
     inputs = {"command": Ideal(asked, flags, ~flags), "measured": Ideal(driven, flags, ~flags)}
-    velocities = pl.DataFrame(dict(zip(("t", "v_x", "v_y", "v_w"), (times, *driven.T), strict=True)))
+    columns = ("t", "v_x", "v_y", "v_w", "x", "y")
+    still = np.zeros((2, times.size))
+    velocities = pl.DataFrame(dict(zip(columns, (times, *driven.T, *still), strict=True)))
     poses = pl.DataFrame({"t": times, "held": flags})
-    (told,) = find_spans(velocities, poses, inputs, vehicle, 0.5).incidents
+    spans = find_spans(velocities, poses, inputs, vehicle, 0.5)
+    (told,) = spans.incidents
     assert told.kind == "side_stopped"
     assert abs(told.start - 60.0) < 1.0
     assert abs(told.end - 75.0) < 1.0
+    events = find_events(velocities, inputs, vehicle, spans).table
+    assert events.filter(pl.col("kind") == "side_stopped")["t_start"].to_list() == [told.start]

@@ -13,14 +13,15 @@ import pytest
 from pipeline.models import Late, find_late_effect
 from pipeline.recording import Finding
 from pipeline.recording.readings import SIDES
-from pipeline.stages import motion_events, spans
+from pipeline.stages import motion_events
 from pipeline.words import findings as words
 from pipeline.words import format_finding
 from pipeline.words.findings import FAULTS, TEMPLATES, Template, fill_template
+from schemas.run_tables import EVENT_KINDS
 
 ROOT = Path(__file__).parents[2]
 OF_TABLES = {
-    ("pipeline.stages.spans", "one.kind"): frozenset(spans._INCIDENTS),
+    ("pipeline.stages.spans", "one.kind"): frozenset(EVENT_KINDS) - {*motion_events._KINDS.values()},
     ("pipeline.stages.motion_events", "kind"): frozenset(motion_events._KINDS.values()),
     ("pipeline.stages.checks", "find_late_effect(Late.HEADING).id"): frozenset(
         {find_late_effect(Late.HEADING).id}
