@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from pipeline.core import NORMAL_95, round_numbers
-from pipeline.models import Number, split_determined
+from pipeline.models import Asked, Number, split_determined
 from pipeline.recording import Finding
 from pipeline.sources import Vehicle
 from pipeline.store import convert_stored
@@ -467,6 +467,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
         budget: causes of the slip and of the 2 s errors of the ideal model, for each input.
         need: whether the log is long enough; None where no effect has a curve.
         commanded_turn: share of the commanded yaw rate that the robot reaches; None without a body command.
+        asked: the largest motion that the run asks for; None where nothing was fitted.
     """
 
     run: str = ""
@@ -493,6 +494,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     budget: tuple[SlipBudget, ...] = ()
     need: DataNeed | None = None
     commanded_turn: CommandedTurn | None = None
+    asked: Asked | None = None
 
     @property
     def has_suggestion(self) -> bool:

@@ -48,7 +48,9 @@ def describe_motion(effect: Named, run: RunDiagnosis) -> str:
     """What the vehicle does by an effect, with its values beside the other effects of the model."""
     if run.vehicle is None or effect.id not in _list_known():
         return name_term(effect.id)
-    return restore_known(effect.id, effect.parameters).describe_motion(run.vehicle, _list_beside(run))
+    return restore_known(effect.id, effect.parameters).describe_motion(
+        run.vehicle, _list_beside(run), run.asked
+    )
 
 
 def describe_clause(effect: Named, run: RunDiagnosis) -> str:
@@ -63,7 +65,9 @@ def describe_clause(effect: Named, run: RunDiagnosis) -> str:
     if effect.own:
         values = [one for one in effect.by_run if not any(value.is_undetermined for value in one.values())]
     beside = _list_beside(run)
-    return _join_range([restore_known(effect.id, one).describe_clause(vehicle, beside) for one in values])
+    return _join_range(
+        [restore_known(effect.id, one).describe_clause(vehicle, beside, run.asked) for one in values]
+    )
 
 
 @lru_cache(maxsize=8)
