@@ -386,6 +386,11 @@ class Parameter:
         least, most = self.physical or ((shown.low, shown.high) if shown else self.bounds)
         return low <= most and high >= least
 
+    def is_wide(self, value: float, low: float, high: float) -> bool:
+        """Whether an interval is as wide as the number is large, or as a typical one if that is larger."""
+        neutral = self.neutral if math.isfinite(self.neutral) else 0.0
+        return high - low >= max(abs(value - neutral), abs(self.typical - neutral))
+
     def is_one_sided(self, low: float, high: float) -> bool:
         """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""
         least, most = self.bounds

@@ -61,6 +61,7 @@ else:
                 "describe_clause",
                 "describe_motion",
                 "describe_separation",
+                "is_open",
                 "name_group",
                 "suggest_drive",
             ),

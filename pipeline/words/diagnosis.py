@@ -47,6 +47,7 @@ from pipeline.words.effects import (
     format_numbers,
     format_with_range,
     is_clock,
+    is_open,
     name_group,
     suggest_drive,
 )
@@ -73,6 +74,7 @@ _WIDEST = 34
 """Largest column width for the values of an effect in a table of effects."""
 _MOST_IN_LINE = 2
 """Most values in one line; an effect with more, as a servo, has one line per value."""
+_NOT_KNOWN = "not yet known"
 _UNCHANGED = "no visible change of the error over 2 s"
 _WHERE_SHOWN = 3
 """Regions of the error that are listed."""
@@ -220,7 +222,16 @@ def format_short(effect: Named) -> str:
     is_said = len(effect.parameters) > 1 or known[0][1].unit == "1"
     # Of two, neither stands for the other: a lag of speed is not one of turning.
     shown = [
-        ", ".join(filter(None, (format_numbers({name: value}), describe_number(effect.id, name) * is_said)))
+        ", ".join(
+            filter(
+                None,
+                (
+                    format_numbers({name: value}),
+                    _NOT_KNOWN * (not value.doubt and is_open(effect.id, name, value)),
+                    describe_number(effect.id, name) * is_said,
+                ),
+            )
+        )
         for name, value in (known if len(known) <= _MOST_IN_LINE else known[:1])
     ]
     hidden = len(known) - len(shown)

@@ -246,7 +246,8 @@ def describe_need(run: RunDiagnosis) -> str:
     known, count = len(need.known), len(need.known) + need.open + (need.others + 1 if need.vague else 0)
     verb = "is" if known == 1 else "are"
     who = need.known[0] if known == count == 1 else f"{known} of {count} parameters"
-    sentences = [f"{who} {verb} known within {_GOAL}"]
+    scale = " (a small one: of a usual value)" if need.is_typical else ""
+    sentences = [f"{who} {verb} known within {_GOAL}{scale}"]
     if known == 0 and count == 1:
         sentences = [f"the one parameter is not known within {_GOAL}"]
     if known == count:
