@@ -391,6 +391,10 @@ class Parameter:
         neutral = self.neutral if math.isfinite(self.neutral) else 0.0
         return high - low >= max(abs(value - neutral), abs(self.typical - neutral))
 
+    def is_large(self, value: float) -> bool:
+        """Whether a value is as far from neutral as a typical one; of a limit, none is."""
+        return abs(value - self.neutral) >= abs(self.typical - self.neutral) < math.inf
+
     def is_one_sided(self, low: float, high: float) -> bool:
         """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""
         least, most = self.bounds

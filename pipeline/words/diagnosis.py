@@ -93,6 +93,13 @@ _INPUTS = {
     "right_angle": "angle that they have turned",
 }
 """Inputs of formulas in words."""
+_ONE_SIDED = {
+    "w0 + abs(w0)": "in left turns",
+    "w0 - abs(w0)": "in right turns",
+    "v0 + abs(v0)": "forward",
+    "v0 - abs(v0)": "backward",
+}
+"""Factors of formulas that are zero but for one way of driving."""
 _FINDINGS_SHOWN = 3
 """Distinct findings that are shown by default; the others are counted, and shown with `--all`."""
 _HEADS_SHOWN = 4
@@ -175,8 +182,9 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     felt, small = _split_ambiguous(run)
     undecided = {item.in_model for item in felt}
     falls = list_largest_falls(run)
-    shown = [one for one in main if one.id not in undecided and falls.get(one.id) != _UNCHANGED]
-    unseen = [one for one in main if falls.get(one.id) == _UNCHANGED and one.id not in undecided]
+    named = [one for one in main if one.id not in undecided]
+    shown = [one for one in named if falls.get(one.id) != _UNCHANGED or one.stands_out]
+    unseen = [one for one in named if one not in shown]
     folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor)
     rows = [
         (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
@@ -312,13 +320,13 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
 
 
 def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named], list[Named]]:
-    """Effects that remove a tenth of the error, with corrected clocks; smaller ones; those without a number.
+    """Effects that remove a tenth of the error or stand out; smaller ones; those without a number.
 
     What this log does not determine, or only at a bound, has no row but with `--all`.
     """
     unknown = [effect for effect in run.effects if not effect.is_determined]
     known = [effect for effect in run.effects if effect.is_determined]
-    return *split_main(known, run.ladder, lambda effect: (effect.id, effect.corrected)), unknown
+    return *split_main(known, run.ladder), unknown
 
 
 def _format_unknown(run: RunDiagnosis) -> str:
@@ -416,6 +424,7 @@ def _list_formula(text: str) -> Iterator[str]:
             names = set(re.findall(r"\w+", term))
             known = [f"{name} = {value.removesuffix(' 1')}" for name, value in numbers if name in names]
             known += [f"{name} the {words}" for name, words in _INPUTS.items() if name in names]
+            known += [f"{one} acts only {words}" for one, words in _ONE_SIDED.items() if one in term]
             yield ", ".join([term, *known])
 
 
