@@ -47,6 +47,7 @@ else:
                 "tabulate_pairs",
             ),
             "diagnosis": (
+                "DEAD_ENCODERS",
                 "VERDICT",
                 "describe",
                 "format_lines",

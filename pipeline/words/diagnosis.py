@@ -106,6 +106,23 @@ _HEADS_SHOWN = 4
 """Most runs that are named one a line by default; the names of more are between the first and the last."""
 _EFFECTS_SHOWN = 5
 """Effects with a line by default."""
+DEAD_ENCODERS = frozenset({"encoder_dead", "wheel_dead"})
+"""Findings on an encoder that does not count."""
+_OF_ENCODERS = frozenset(
+    {
+        "digging_in",
+        "pushed",
+        "side_stopped",
+        "sliding",
+        "spinning",
+        "stuck",
+        "wheel_radius_wrong",
+        "wheel_scale",
+        "wheels_delay",
+        "wheels_left_out",
+    }
+)
+"""Findings that a dead encoder makes by itself."""
 _RANK = {"error": 0, "warning": 1, "info": 3}
 _LONGEST_TERM = 70
 """Characters up to which a suggested term is shown: a longer one is no formula that anybody reads."""
@@ -573,7 +590,9 @@ def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everyt
     """
     by_kind: dict[tuple[Severity, str, str], dict[str, list[str]]] = {}
     for run, findings in runs.items():
-        for severity, one, text in _join_incidents(findings):
+        is_dead = any(one.id in DEAD_ENCODERS for one in findings)
+        for severity, one, said in _join_incidents(findings):
+            text = f"perhaps by the dead encoder: {said}" if is_dead and one.id in _OF_ENCODERS else said
             if text.casefold() not in verdict.casefold():
                 # Where one run is asked, two findings of a kind are two things.
                 kind = (severity, one.id if len(runs) > 1 else text, one.where)

@@ -167,3 +167,13 @@ def test_a_number_that_is_hardly_known_is_no_number_of_the_verdict() -> None:
     assert format_short(wide) == "d = 0.47 s [0.14, 0.74], not yet known"
     friction = replace(friction, parameters={"friction": Number(0.5, 0.1, 0.9), "k": Number(1.7, 1.6, 1.8)})
     assert "0.5" not in describe_clause(friction, drawn)
+
+
+def test_what_a_dead_encoder_makes_is_no_fact_beside_it() -> None:
+    stretch = {"side": "left", "reads": "zero"}
+    values = {"stretches": [stretch], "witnesses": ["pose"], "line": "ignore = [[0, 9]]"}
+    dead, stuck = Finding("encoder_dead", "warning", "wheels", values), Finding("stuck", "warning")
+    shown = [text for _, text in list_findings({"run": [dead, stuck]}, "", everything=True)]
+    assert [text.startswith("!  perhaps by the dead encoder: ") for text in shown] == [False, True]
+    (alone,) = list_findings({"run": [stuck]}, "", everything=True)
+    assert "dead" not in alone[1]
