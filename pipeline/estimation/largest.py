@@ -80,8 +80,8 @@ def _find_exceeded(seconds: Floats, sizes: Floats) -> float:
     """The largest size that is reached during 2 s in all; zero where it would be standing."""
     order = np.argsort(-sizes)
     index = int(np.searchsorted(np.cumsum(seconds[order]), HORIZON_S))
-    found = float(sizes[order[index]]) if index < sizes.size else 0.0
-    return found if found > STANDING else 0.0
+    exceeded = float(sizes[order[index]]) if index < sizes.size else 0.0
+    return exceeded if exceeded > STANDING else 0.0
 
 
 def _is_one_speed(fastest: Floats) -> bool:
