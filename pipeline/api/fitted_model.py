@@ -17,6 +17,7 @@ from pipeline.datasets import ModelFit
 from pipeline.estimation import EstimationData, ModelState
 from pipeline.estimation.additions import Tries
 from pipeline.estimation.ladder import find_share_removed
+from pipeline.estimation.largest import measure_asked
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.estimation.transfer import fit_as_it_is
@@ -355,10 +356,11 @@ class Model:
             tries = Tries(data, model, run.list_diagnosed(data.vehicle))
             helping = tries.fold([one for one in tries.try_each() if one is not None])
         without = to_json(tries.before)
+        asked = measure_asked(data.runs, data.vehicle)
         rows = [
             {
                 "effect": one.effect.id,
-                "sentence": one.effect.describe_motion(data.vehicle, model),
+                "sentence": one.effect.describe_motion(data.vehicle, model, asked),
                 **{name: errors[name] for name in _OVER_2S},
                 **{f"{name[0]}_removed": _find_removed(errors, without, name) for name in _OVER_2S},
                 "same_as": list(one.twins),

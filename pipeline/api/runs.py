@@ -38,6 +38,7 @@ from pipeline.datasets import (
     check_runs,
     read_limits,
 )
+from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.models import ModelFile, read_model
 from pipeline.report import format_distance
 from pipeline.report.motion_view import MotionView, view_diagnosis
@@ -47,7 +48,14 @@ from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result, read_sug
 from pipeline.results import read_model as read_diagnosed_model
 from pipeline.sources import Owner, load_vehicle
 from pipeline.store import REPORT, Manifest, Store, find_run, read_choices, to_arrow
-from pipeline.words import check_as_json, diagnosis_as_json, format_junit, format_markdown, list_check_lines
+from pipeline.words import (
+    check_as_json,
+    diagnosis_as_json,
+    format_junit,
+    format_markdown,
+    format_verdict,
+    list_check_lines,
+)
 from pipeline.words import diagnosis as words
 from schemas import contract_of
 
@@ -146,6 +154,9 @@ class Run(StoredRun):
         self.name = manifest.run
         self.summary: Content = manifest.read_json(SUMMARY)
         self.verdict = str(self.summary.get("verdict") or "")
+        # One of `slip diagnose` is beside the results of the analysis.
+        if not self.verdict and (stored := find_diagnosis(store.root, manifest)) is not None:
+            self.verdict = format_verdict(stored)
         self.vehicle = load_vehicle(manifest)
         self.duration_s = number_in(self.summary, "duration_s")
         self.distance_m = number_in(self.summary, "distance_m")

@@ -341,10 +341,11 @@ def format_watch(look: Mapping[str, Any]) -> list[str]:
         ("so far", format_duration(look["t_s"])),
         ("slip", slip and f"{slip} (median)"),
         ("error", errors and f"{format_errors(*errors)} over 2 s with the model so far"),
-        *(("known", f"{one['effect']}: {one['parameter']} {_format_known(one)}") for one in look["known"]),
+        *_list_known(look["known"]),
         *(("events", f"{one['t_start']:.1f} s: {one['text']}") for one in look["events"][-_EVENTS_SHOWN:]),
         *(("drive", text) for text in look["drive_next"]),
         ("enough", "all effects are known within 5 %: no more driving is needed" * look["enough"]),
+        ("vehicle", look["vehicle"]),
         ("not yet", look["problem"]),
     ]
     shown = [(label, text) for label, text in rows if text]
@@ -354,7 +355,14 @@ def format_watch(look: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _format_known(one: Mapping[str, Any]) -> str:
-    if one["low"] is None or one["high"] is None:
-        return "not determined"
-    return str(format_interval(one["value"], one["low"], one["high"], one["unit"]))
+def _list_known(numbers: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Label and text of each number: those that are known, then those that the recording leaves open."""
+    rows = []
+    for one in sorted(numbers, key=lambda one: not one["is_known"]):
+        text = "not determined"
+        if one["low"] is not None and one["high"] is not None:
+            text = format_interval(one["value"], one["low"], one["high"], one["unit"])
+            text += "" if one["is_known"] else ", not yet known"
+        label = "known" if one["is_known"] else "open"
+        rows.append((label, f"{one['effect']}: {one['parameter']} {text}"))
+    return rows

@@ -32,6 +32,7 @@ from pipeline.estimation.estimates import (
     was_aligned,
 )
 from pipeline.estimation.ladder import ModelAssessment, assess_model, list_order, note_fit
+from pipeline.estimation.largest import measure_asked
 from pipeline.estimation.plausibility import measure_moves, note_unusual
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import (
@@ -244,6 +245,7 @@ def of_run(
         timing=delays,
         when=tuple(one for one in common.when if one.run == number),
         commanded_turn=measure_commanded_turn(data.runs[number], data.vehicle),
+        asked=measure_asked(data.runs[number : number + 1], data.vehicle),
     )
 
 

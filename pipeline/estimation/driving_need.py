@@ -96,7 +96,7 @@ def measure_need(effects: Sequence[Named], widths: Mapping[str, Curve]) -> DataN
     """How well the driven time determines the parameters of effects, and how much more is needed.
 
     A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger,
-    and open if the interval is as wide as that value itself.
+    and open if its interval is as wide as the number itself (`Number.is_open`).
 
     Args:
         effects: identified effects.
@@ -113,7 +113,7 @@ def measure_need(effects: Sequence[Named], widths: Mapping[str, Curve]) -> DataN
             if curve is None:
                 continue
             half, goal = float(curve.values[-1]), find_goal(effect.id, name, value.value)
-            if value.is_undetermined or not half < goal / INTERVAL_SHARE:
+            if value.is_open(find_effect(effect.id)().parameter(name)) or not half < goal / INTERVAL_SHARE:
                 open_ones += 1
                 continue
             since = last_until(curve, goal)

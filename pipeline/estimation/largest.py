@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import Floats
-from pipeline.models import EXCEEDED_SHARE, Largest
-from pipeline.run import SPAN_S, MotionRun, find_fastest_wheel, name_inputs, split_wheels
+from pipeline.models import EXCEEDED_SHARE, STANDING, Asked, Largest
+from pipeline.run import HORIZON_S, SPAN_S, MotionRun, find_fastest_wheel, name_inputs, split_wheels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,6 +55,33 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns, rim=rim,
         is_one_speed=_is_one_speed(np.concatenate(fastest or [np.zeros(0)])),
     )  # fmt: skip
+
+
+def measure_asked(runs: Sequence[MotionRun], vehicle: Vehicle) -> Asked:
+    """The largest speed, and the largest yaw rate on the spot, that runs ask for during 2 s in all."""
+    held, speeds, turns = list[Floats](), list[Floats](), list[Floats]()
+    for run in runs:
+        series = run.commands or run.wheels
+        if series is not None:
+            forward, _, yaw_rate = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+            held.append(np.minimum(np.diff(series.times, append=series.times[-1:]), SPAN_S))
+            speeds.append(np.abs(forward))
+            turns.append(np.abs(yaw_rate))
+    if not held:
+        return Asked()
+    seconds, speed, turn = map(np.concatenate, (held, speeds, turns))
+    on_the_spot = speed < _STANDS * speed.max(initial=0.0)
+    # Of a run that only turns, no speed is above rounding.
+    turned = turn * (on_the_spot | (speed < _STILL))
+    return Asked(_find_exceeded(seconds, speed), _find_exceeded(seconds, turned))
+
+
+def _find_exceeded(seconds: Floats, sizes: Floats) -> float:
+    """The largest size that is reached during 2 s in all; zero where it would be standing."""
+    order = np.argsort(-sizes)
+    index = int(np.searchsorted(np.cumsum(seconds[order]), HORIZON_S))
+    exceeded = float(sizes[order[index]]) if index < sizes.size else 0.0
+    return exceeded if exceeded > STANDING else 0.0
 
 
 def _is_one_speed(fastest: Floats) -> bool:

@@ -30,7 +30,7 @@ from pipeline.results import (
     read_findings,
     read_result,
 )
-from pipeline.words import describe_need, describe_separation, format_finding, suggest_drive
+from pipeline.words import describe_need, describe_separation, format_finding, is_open, suggest_drive
 
 RUNNING_T = 2.0 * LEAST_T
 """Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make bench NAME=watch` counts
@@ -145,8 +145,8 @@ def summarize(answer: dict[str, Any], diagnosis: RunDiagnosis, before: Sequence[
     Returns:
         ``t_s``, recorded time [s]; ``slip``, median slip modulus [m/s] by input; ``error``, of the model so
         far over 2 s of driving that was not fitted; ``known``, from `list_known`; ``drive_next``, sentences;
-        ``events``; ``enough``, whether more such driving changes nothing; ``problem``, why there is no answer
-        yet, else empty.
+        ``events``; ``enough``, whether more such driving changes nothing; ``vehicle``, that its lengths are a
+        guess, else empty; ``problem``, why there is no answer yet, else empty.
     """
     findings, ladder, known = read_findings(answer), diagnosis.ladder, list_known(diagnosis, before)
     # All effects are reported, within the share that is the goal, and the model is at the noise floor.
@@ -174,6 +174,7 @@ def summarize(answer: dict[str, Any], diagnosis: RunDiagnosis, before: Sequence[
             for one in events[-_MOST_EVENTS:]
         ],
         "enough": is_enough,
+        "vehicle": next((format_finding(one) for one in findings if one.id == "vehicle_fitted"), ""),
         "problem": answer.get("problem") or (format_finding(refusal) if refusal else ""),
     }
 
@@ -198,8 +199,9 @@ def list_known(diagnosis: RunDiagnosis, before: Sequence[str] | None) -> list[di
         before: result of `list_passing` for the look before; None for a closed recording.
 
     Returns:
-        ``effect``, ``parameter``, ``value``, ``low`` and ``high`` (95 %), ``unit`` of each; ``is_narrow``,
-        whether the interval is as narrow as more driving is meant to make it.
+        ``effect``, ``parameter``, ``value``, ``low`` and ``high`` (95 %), ``unit`` of each; ``is_known``,
+        whether the recording tells how large it is; ``is_narrow``, whether the interval is as narrow as more
+        driving is meant to make it.
     """
     passing = list_passing(diagnosis)
     return [
@@ -208,6 +210,7 @@ def list_known(diagnosis: RunDiagnosis, before: Sequence[str] | None) -> list[di
             "parameter": name,
             **pick_finite(value, "value", "low", "high"),
             "unit": value.unit,
+            "is_known": not is_open(effect.id, name, value),
             "is_narrow": 0.5 * (value.high - value.low) <= find_goal(effect.id, name, value.value),
         }
         for effect in diagnosis.effects

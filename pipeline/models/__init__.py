@@ -106,6 +106,8 @@ else:
                 "EXCEEDED_SHARE",
                 "LEAST_DELAY_S",
                 "OVERSHOOT",
+                "STANDING",
+                "Asked",
                 "Conditions",
                 "Excitation",
                 "Largest",

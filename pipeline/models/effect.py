@@ -15,6 +15,7 @@ from typing import ClassVar, Literal, Self, TypeVar
 from pipeline.core import suffix_unit
 from pipeline.models.pairs import list_pairs
 from pipeline.models.parameter import (
+    Asked,
     Conditions,
     Excitation,
     Largest,
@@ -214,39 +215,47 @@ class Effect(ABC):
             }
         )
 
-    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+    def describe_motion(
+        self, vehicle: Vehicle, beside: Iterable[Effect] = (), asked: Asked | None = None
+    ) -> str:
         """What the vehicle does, with numbers: the words of `words.toml`, or all parameters.
 
         Args:
             vehicle: its nominal geometry.
             beside: all effects of the model, for numbers that depend on other effects.
+            asked: what the run asked for, for numbers that depend on it; None without a run.
         """
-        said = self._make_sentences(vehicle, beside)
+        said = self._make_sentences(vehicle, beside, asked)
         if said.words.motion:
             return said.describe_motion()
         known = [p for p in self.parameters if p.name not in self.open_numbers]
         numbers = [f"{p.name} = {self.values[p.name]:.3g}{suffix_unit(p.unit)}" for p in known]
         return f"{said.title}: {', '.join(numbers)}"
 
-    def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers, as a clause of a sentence."""
-        said = self._make_sentences(vehicle, beside)
+    def describe_clause(
+        self, vehicle: Vehicle, beside: Iterable[Effect] = (), asked: Asked | None = None
+    ) -> str:
+        """What the vehicle does, with numbers, as a clause of a sentence; see `describe_motion`."""
+        said = self._make_sentences(vehicle, beside, asked)
         does = said.describe_clause() if said.words.motion else ""
         return does or f"shows signs of {self.id.replace('_', ' ')}"
 
-    def _make_sentences(self, vehicle: Vehicle, beside: Iterable[Effect]) -> Sentences:
+    def _make_sentences(self, vehicle: Vehicle, beside: Iterable[Effect], asked: Asked | None) -> Sentences:
         beside = tuple(beside)
         others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}
         title = self.id.replace("_", " ").capitalize()
-        values = {**self.values, **self.list_seen(vehicle, beside)}
+        values = {**self.values, **self.list_seen(vehicle, beside, asked)}
         return Sentences(title, find_words(self.id), values, vehicle, self.open_numbers, others)
 
-    def list_seen(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> Mapping[str, float]:
+    def list_seen(
+        self, vehicle: Vehicle, beside: Iterable[Effect] = (), asked: Asked | None = None
+    ) -> Mapping[str, float]:
         """Numbers that its sentences have beside its own: what a person sees of it, by name.
 
         Args:
             vehicle: its nominal geometry.
             beside: all effects of the model.
+            asked: what the run asked for; None without a run.
         """
         return {}
 

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.core import Floats
 from pipeline.models.effect import AddedEffect, Effect, Excitation, Parameter
 from pipeline.models.expression import Expression, parse_expression
-from pipeline.models.parameter import Unit, parse_unit
+from pipeline.models.parameter import Asked, Unit, parse_unit
 from pipeline.run import MotionError, Rolling, RunContext, Velocity, roll_ideally
 from pipeline.sources import Vehicle
 
@@ -145,7 +145,9 @@ class FormulaEffect(AddedEffect):
         lines += [f"    {channel} += {text}" for channel, text in self.formulas.items()]
         return "\n".join(lines)
 
-    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+    def describe_motion(
+        self, vehicle: Vehicle, beside: Iterable[Effect] = (), asked: Asked | None = None
+    ) -> str:
         """The formulas themselves."""
         return "Formula: " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 

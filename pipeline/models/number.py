@@ -100,6 +100,10 @@ class Number(msgspec.Struct, frozen=True):
         """Whether the runs do not determine it: no finite interval, one limit only, or at its bound."""
         return self.at_bound or self.doubt == ONE_LIMIT or not math.isfinite(self.high - self.low)
 
+    def is_open(self, parameter: Parameter) -> bool:
+        """Whether the runs do not tell how large it is: undetermined, or its interval is as wide as it."""
+        return self.is_undetermined or parameter.is_wide(self.value, self.low, self.high)
+
     @property
     def half(self) -> float:
         """The wider half of its interval: the other half may be cut at a bound of the parameter."""

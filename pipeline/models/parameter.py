@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
+import msgspec
+
 from pipeline.core import JSON_DIGITS, NORMAL_95, Floats, round_digits
 from pipeline.run import MotionError
 
@@ -82,7 +84,7 @@ Relative = Literal["", "speed", "turn", "wheel", "duration"]
 # Smallest delay between poses, headings and encoders to report [s]: time stamps are no more accurate.
 LEAST_DELAY_S = 0.012
 
-_STANDING = 0.05
+STANDING = 0.05
 """Speed and yaw rate [m/s, rad/s] that a run must both exceed to count as driving and turning."""
 _NEVER = 0.02
 """Share of the larger of speed and yaw rate; below it the smaller one counts as zero."""
@@ -93,6 +95,18 @@ EXCEEDED_SHARE = 0.005
 """Share of the time in which wheels may exceed a limit: allows two wrong windows in a run of some minutes."""
 OVERSHOOT = 1.05
 """Largest wheel speed over its limit: allows for rounding of encoders and overshoot of a motor."""
+
+
+class Asked(msgspec.Struct, frozen=True):
+    """The largest motion that a run asks for, by which an effect without a plain number is described.
+
+    Attributes:
+        speed_mps: speed that is exceeded for 2 s in all; zero where it hardly drives.
+        turn_radps: yaw rate on the spot that is exceeded for 2 s in all; zero where it hardly turns so.
+    """
+
+    speed_mps: float = 0.0
+    turn_radps: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,7 +141,7 @@ class Largest:
     @property
     def moves_both_ways(self) -> bool:
         """Whether a run both drives and turns."""
-        return min(self.fastest, self.turn) > _STANDING
+        return min(self.fastest, self.turn) > STANDING
 
     @property
     def is_one_motion(self) -> bool:
@@ -371,6 +385,15 @@ class Parameter:
         shown = self.plausible
         least, most = self.physical or ((shown.low, shown.high) if shown else self.bounds)
         return low <= most and high >= least
+
+    def is_wide(self, value: float, low: float, high: float) -> bool:
+        """Whether an interval is as wide as the number is large, or as a typical one if that is larger."""
+        neutral = self.neutral if math.isfinite(self.neutral) else 0.0
+        return high - low >= max(abs(value - neutral), abs(self.typical - neutral))
+
+    def is_large(self, value: float) -> bool:
+        """Whether a value is as far from neutral as a typical one; of a limit, none is."""
+        return abs(value - self.neutral) >= abs(self.typical - self.neutral) < math.inf
 
     def is_one_sided(self, low: float, high: float) -> bool:
         """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""

@@ -389,7 +389,7 @@ def format_remaining(report: RunReport) -> str:
 def view_why(report: RunReport) -> dict[str, object]:
     """Effects, open questions, and the split in one sentence."""
     diagnosis = report.diagnosis
-    main, minor = split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
+    main, minor = split_main(diagnosis.effects, diagnosis.ladder)
     rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
     split = report.part("split")
     drivetrain, ground, cross = (number_in(split, name) for name in ("drivetrain", "ground", "cross"))

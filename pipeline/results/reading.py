@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Final, cast
 
 from pipeline.core import (
     JSON_DIGITS,
@@ -19,7 +19,7 @@ from pipeline.core import (
     round_numbers,
 )
 from pipeline.recording import FAULTS, Finding
-from pipeline.results.structs import Errors, RunDiagnosis, Step
+from pipeline.results.structs import Errors, Named, RunDiagnosis, Step
 from pipeline.run import GROUND_UNOBSERVABLE
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
     from pipeline.store import JSON
 
-Entry = TypeVar("Entry")
 
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """Quantity and unit by name in `Errors` and in JSON."""
@@ -170,27 +169,17 @@ def rank_main(ladder: Sequence[Step]) -> dict[str, float]:
     return dict([*ranked.items()][: max([*large, 0]) + 1])
 
 
-def split_main(
-    effects: Sequence[Entry], ladder: Sequence[Step], read: Callable[[Entry], tuple[str, bool]]
-) -> tuple[list[Entry], list[Entry]]:
-    """The effects of `rank_main` with the clocks that were corrected, and the smaller effects.
-
-    A clock that was corrected before the first fit has no step of the ladder that could show it to be small.
-
-    Args:
-        effects: that were named.
-        ladder: as in `rank_main`.
-        read: the id of one of them, and whether it was corrected.
+def split_main(effects: Sequence[Named], ladder: Sequence[Step]) -> tuple[list[Named], list[Named]]:
+    """The effects of `rank_main` with those that stand out (`Named.stands_out`), and the smaller effects.
 
     Returns:
         Main and smaller effects in their order; where `rank_main` lists none, all are main.
     """
     first = rank_main(ladder)
-    if not first.keys() & {read(effect)[0] for effect in effects}:
+    if not first.keys() & {effect.id for effect in effects}:
         return list(effects), []
-    is_main = [name in first or corrected for name, corrected in map(read, effects)]
-    main = [effect for effect, chosen in zip(effects, is_main, strict=True) if chosen]
-    return main, [effect for effect, chosen in zip(effects, is_main, strict=True) if not chosen]
+    main = [effect for effect in effects if effect.id in first or effect.stands_out]
+    return main, [effect for effect in effects if effect not in main]
 
 
 def is_small(name: str | None, ladder: Sequence[Step]) -> bool:

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from pipeline.core import NORMAL_95, round_numbers
-from pipeline.models import Number, split_determined
+from pipeline.models import Asked, Number, list_effects, split_determined
 from pipeline.recording import Finding
 from pipeline.sources import Vehicle
 from pipeline.store import convert_stored
@@ -95,6 +95,21 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
         """Whether the runs determine one of its numbers; a corrected clock was measured beforehand."""
         known = any(split_determined(one)[0] for one in (self.parameters, *self.by_run))
         return self.corrected or not self.parameters or known
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether people act on it however little error it removes in this run.
+
+        It is a clock that was corrected before the first fit, which no step of the ladder shows, or a number
+        that the run knows is as large as is typical of the effect: commands that arrive late matter in
+        another drive.
+        """
+        kind = next((kind for kind in list_effects() if kind.id == self.id), None)
+        return self.corrected or any(
+            parameter.is_large(value.value) and not value.is_open(parameter)
+            for parameter in (() if kind is None else kind.parameters)
+            if (value := self.shown.get(parameter.name)) is not None
+        )
 
     @property
     def own(self) -> set[str]:
@@ -467,6 +482,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
         budget: causes of the slip and of the 2 s errors of the ideal model, for each input.
         need: whether the log is long enough; None where no effect has a curve.
         commanded_turn: share of the commanded yaw rate that the robot reaches; None without a body command.
+        asked: the largest motion that the run asks for; None where nothing was fitted.
     """
 
     run: str = ""
@@ -493,6 +509,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     budget: tuple[SlipBudget, ...] = ()
     need: DataNeed | None = None
     commanded_turn: CommandedTurn | None = None
+    asked: Asked | None = None
 
     @property
     def has_suggestion(self) -> bool:

@@ -265,6 +265,8 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         "of": "wheels" if ideal is samples.measured else "command",
         "moved_m": net,
     }
+    if turned >= _NET_OF_NO_MOTION:
+        values |= {"turned_rad": turned, "turning": gains[2]}
     return [Finding("not_moving", "error", "", values)]
 
 

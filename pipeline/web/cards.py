@@ -6,6 +6,7 @@ import re
 from pipeline.core import split_interval
 from pipeline.estimation.additions import Addition
 from pipeline.models import (
+    Asked,
     Effect,
     FormulaEffect,
     Model,
@@ -31,11 +32,11 @@ _PARAMETER = re.compile(
 )
 
 
-def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str, object]:
+def show_addition(addition: Addition, before: Errors, model: Model, asked: Asked) -> dict[str, object]:
     """Change of a model's errors over 2 s by an additional effect."""
     effect, after = addition.effect, addition.errors
     return {
-        **describe_effect(effect, model),
+        **describe_effect(effect, model, asked),
         "left": addition.remaining,
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},
@@ -43,13 +44,13 @@ def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str,
     }
 
 
-def describe_effect(effect: Effect, model: Model) -> dict[str, object]:
+def describe_effect(effect: Effect, model: Model, asked: Asked) -> dict[str, object]:
     """What an effect of a model is, and what it does here; its formula if it is one."""
     formulas = effect.formulas if isinstance(effect, FormulaEffect) else {}
     return {
         "id": effect.id,
         "about": _summarize(effect),
-        "sentence": "" if effect.is_neutral else effect.describe_motion(model.vehicle, model),
+        "sentence": "" if effect.is_neutral else effect.describe_motion(model.vehicle, model, asked),
         "formula": [f"{key} += {text}" for key, text in formulas.items()],
     }
 

@@ -17,8 +17,9 @@ from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import LadderStep, ModelAssessment, judge_whole, note_fit
+from pipeline.estimation.largest import measure_asked
 from pipeline.estimation.prediction import predict_at_from
-from pipeline.models import Model, ModelFile, Timing
+from pipeline.models import Asked, Model, ModelFile, Timing
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.results import Errors, RunDiagnosis, SlipBudget, Step, list_excess
 from pipeline.run import HORIZON_S, MotionRun, load_motion_run
@@ -68,6 +69,11 @@ class PreparedRun:
         """Available inputs for models of the run, the default first."""
         there = {Input.COMMAND: self.run.commands, Input.MEASURED: self.run.wheels}
         return [source.value for source, signals in there.items() if signals is not None]
+
+    @cached_property
+    def asked(self) -> Asked:
+        """The largest motion that the run asks for."""
+        return measure_asked([self.run], self.vehicle)
 
     @cached_property
     def floor(self) -> Errors:

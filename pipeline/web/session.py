@@ -110,7 +110,8 @@ class Session:
         weighed = (weigh_addition(before, prepared.judge(model + one).step, one.id) for one in missing)
         accepted = [one for one in weighed if one is not None and not one.refusal]
         errors = prepared.score(step.model, step.wheel_delay_s)
-        return [show_addition(one, errors, model) for one in sorted(accepted, key=lambda one: one.remaining)]
+        ordered = sorted(accepted, key=lambda one: one.remaining)
+        return [show_addition(one, errors, model, prepared.asked) for one in ordered]
 
     def add(self, effects: Sequence[Effect | str], *, anyway: bool = False) -> Session:
         """Add effects to the model at once, and fit the whole model.

@@ -59,7 +59,9 @@ class Trial:
             self.total = len(tries.candidates)
             for addition in tries.try_each():
                 additions += [] if addition is None else [addition]
-                self.helpful = [show_addition(one, tries.before, model) for one in tries.fold(additions)]
+                self.helpful = [
+                    show_addition(one, tries.before, model, prepared.asked) for one in tries.fold(additions)
+                ]
                 self.tried += 1
                 if self.stopped:
                     return
@@ -274,7 +276,7 @@ def show_card(session: Session, name: str) -> dict[str, object]:
     step, effect = session.step, session.step.model.effect(name)
     file = ModelFile(step.model, numbers=step.numbers)
     return {
-        **describe_effect(effect, step.model),
+        **describe_effect(effect, step.model, session.prepared.asked),
         "without_m": step.without.get(name),
         "refused": step.refused.get(name),
         "parameters": [

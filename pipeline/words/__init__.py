@@ -47,6 +47,7 @@ else:
                 "tabulate_pairs",
             ),
             "diagnosis": (
+                "DEAD_ENCODERS",
                 "VERDICT",
                 "describe",
                 "format_lines",
@@ -61,6 +62,7 @@ else:
                 "describe_clause",
                 "describe_motion",
                 "describe_separation",
+                "is_open",
                 "name_group",
                 "suggest_drive",
             ),

@@ -47,6 +47,7 @@ from pipeline.words.effects import (
     format_numbers,
     format_with_range,
     is_clock,
+    is_open,
     name_group,
     suggest_drive,
 )
@@ -73,6 +74,7 @@ _WIDEST = 34
 """Largest column width for the values of an effect in a table of effects."""
 _MOST_IN_LINE = 2
 """Most values in one line; an effect with more, as a servo, has one line per value."""
+_NOT_KNOWN = "not yet known"
 _UNCHANGED = "no visible change of the error over 2 s"
 _WHERE_SHOWN = 3
 """Regions of the error that are listed."""
@@ -91,12 +93,36 @@ _INPUTS = {
     "right_angle": "angle that they have turned",
 }
 """Inputs of formulas in words."""
+_ONE_SIDED = {
+    "w0 + abs(w0)": "in left turns",
+    "w0 - abs(w0)": "in right turns",
+    "v0 + abs(v0)": "forward",
+    "v0 - abs(v0)": "backward",
+}
+"""Factors of formulas that are zero but for one way of driving."""
 _FINDINGS_SHOWN = 3
 """Distinct findings that are shown by default; the others are counted, and shown with `--all`."""
 _HEADS_SHOWN = 4
 """Most runs that are named one a line by default; the names of more are between the first and the last."""
 _EFFECTS_SHOWN = 5
 """Effects with a line by default."""
+DEAD_ENCODERS = frozenset({"encoder_dead", "wheel_dead"})
+"""Findings on an encoder that does not count."""
+_OF_ENCODERS = frozenset(
+    {
+        "digging_in",
+        "pushed",
+        "side_stopped",
+        "sliding",
+        "spinning",
+        "stuck",
+        "wheel_radius_wrong",
+        "wheel_scale",
+        "wheels_delay",
+        "wheels_left_out",
+    }
+)
+"""Findings that a dead encoder makes by itself."""
 _RANK = {"error": 0, "warning": 1, "info": 3}
 _LONGEST_TERM = 70
 """Characters up to which a suggested term is shown: a longer one is no formula that anybody reads."""
@@ -173,8 +199,9 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     felt, small = _split_ambiguous(run)
     undecided = {item.in_model for item in felt}
     falls = list_largest_falls(run)
-    shown = [one for one in main if one.id not in undecided and falls.get(one.id) != _UNCHANGED]
-    unseen = [one for one in main if falls.get(one.id) == _UNCHANGED and one.id not in undecided]
+    named = [one for one in main if one.id not in undecided]
+    shown = [one for one in named if falls.get(one.id) != _UNCHANGED or one.stands_out]
+    unseen = [one for one in named if one not in shown]
     folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor)
     rows = [
         (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
@@ -220,7 +247,16 @@ def format_short(effect: Named) -> str:
     is_said = len(effect.parameters) > 1 or known[0][1].unit == "1"
     # Of two, neither stands for the other: a lag of speed is not one of turning.
     shown = [
-        ", ".join(filter(None, (format_numbers({name: value}), describe_number(effect.id, name) * is_said)))
+        ", ".join(
+            filter(
+                None,
+                (
+                    format_numbers({name: value}),
+                    _NOT_KNOWN * (not value.doubt and is_open(effect.id, name, value)),
+                    describe_number(effect.id, name) * is_said,
+                ),
+            )
+        )
         for name, value in (known if len(known) <= _MOST_IN_LINE else known[:1])
     ]
     hidden = len(known) - len(shown)
@@ -301,13 +337,13 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
 
 
 def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named], list[Named]]:
-    """Effects that remove a tenth of the error, with corrected clocks; smaller ones; those without a number.
+    """Effects that remove a tenth of the error or stand out; smaller ones; those without a number.
 
     What this log does not determine, or only at a bound, has no row but with `--all`.
     """
     unknown = [effect for effect in run.effects if not effect.is_determined]
     known = [effect for effect in run.effects if effect.is_determined]
-    return *split_main(known, run.ladder, lambda effect: (effect.id, effect.corrected)), unknown
+    return *split_main(known, run.ladder), unknown
 
 
 def _format_unknown(run: RunDiagnosis) -> str:
@@ -405,6 +441,7 @@ def _list_formula(text: str) -> Iterator[str]:
             names = set(re.findall(r"\w+", term))
             known = [f"{name} = {value.removesuffix(' 1')}" for name, value in numbers if name in names]
             known += [f"{name} the {words}" for name, words in _INPUTS.items() if name in names]
+            known += [f"{one} acts only {words}" for one, words in _ONE_SIDED.items() if one in term]
             yield ", ".join([term, *known])
 
 
@@ -553,7 +590,9 @@ def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everyt
     """
     by_kind: dict[tuple[Severity, str, str], dict[str, list[str]]] = {}
     for run, findings in runs.items():
-        for severity, one, text in _join_incidents(findings):
+        is_dead = any(one.id in DEAD_ENCODERS for one in findings)
+        for severity, one, said in _join_incidents(findings):
+            text = f"perhaps by the dead encoder: {said}" if is_dead and one.id in _OF_ENCODERS else said
             if text.casefold() not in verdict.casefold():
                 # Where one run is asked, two findings of a kind are two things.
                 kind = (severity, one.id if len(runs) > 1 else text, one.where)

@@ -36,7 +36,7 @@ def restore_known(name: str, values: Mapping[str, Number]) -> Effect:
     effect = new.change(**{k: new.parameter(k).round(one.value, one.digits) for k, one in values.items()})
     if len(new.parameters) == 1:
         return effect
-    unknown = {key: one for key, one in values.items() if one.is_undetermined}
+    unknown = {key: one for key, one in values.items() if one.is_open(new.parameter(key))}
     return effect.omit_open(
         key
         for key, one in unknown.items()
@@ -44,26 +44,44 @@ def restore_known(name: str, values: Mapping[str, Number]) -> Effect:
     )
 
 
+def is_open(effect: str, name: str, number: Number) -> bool:
+    """Whether the runs do not tell how large a number of an effect is."""
+    kind = _list_known().get(effect)
+    return number.is_undetermined if kind is None else number.is_open(kind().parameter(name))
+
+
+def _list_ends(name: str, values: Mapping[str, Number]) -> list[Mapping[str, Number]]:
+    """The values of an effect; of one number that its interval leaves open, both ends of it."""
+    wide = [key for key, one in values.items() if not one.is_undetermined and is_open(name, key, one)]
+    if len(values) != 1 or not wide:
+        return [values]
+    return [{key: Number(end)} for key in wide for end in (values[key].low, values[key].high)]
+
+
 def describe_motion(effect: Named, run: RunDiagnosis) -> str:
     """What the vehicle does by an effect, with its values beside the other effects of the model."""
-    if run.vehicle is None or effect.id not in _list_known():
+    vehicle = run.vehicle
+    if vehicle is None or effect.id not in _list_known():
         return name_term(effect.id)
-    return restore_known(effect.id, effect.parameters).describe_motion(run.vehicle, _list_beside(run))
+    effects = [restore_known(effect.id, one) for one in _list_ends(effect.id, effect.parameters)]
+    texts = [one.describe_motion(vehicle, _list_beside(run), run.asked) for one in effects]
+    return _join_range(texts) or " to ".join(texts)
 
 
 def describe_clause(effect: Named, run: RunDiagnosis) -> str:
     """What the vehicle does by an effect, as a clause; empty where its vehicle is unknown.
 
-    Where runs or grounds have their own values it is a range: `turns at 40 to 52 % of the ideal rate`.
+    Where runs or grounds have their own values, or where the run leaves its only number open, it is a range:
+    `turns at 40 to 52 % of the ideal rate`.
     """
     vehicle = run.vehicle
     if vehicle is None or effect.id not in _list_known():
         return ""
-    values = [effect.parameters]
+    values = _list_ends(effect.id, effect.parameters)
     if effect.own:
         values = [one for one in effect.by_run if not any(value.is_undetermined for value in one.values())]
-    beside = _list_beside(run)
-    return _join_range([restore_known(effect.id, one).describe_clause(vehicle, beside) for one in values])
+    effects, beside = [restore_known(effect.id, one) for one in values], _list_beside(run)
+    return _join_range([one.describe_clause(vehicle, beside, run.asked) for one in effects])
 
 
 @lru_cache(maxsize=8)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from pipeline.core import (
+    INPUT_WORDS,
     enumerate_texts,
     format_angle,
     format_count,
@@ -187,7 +188,9 @@ def describe_structure(rest: Unexplained) -> str:
     if rest.kind == "formula":
         names = set(re.findall(r"\w+", rest.formula or ""))
         repeats = [words for name, words in _REPEATS.items() if name in names]
-        text = f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
+        source = f", {INPUT_WORDS[rest.path]}" if rest.path in INPUT_WORDS else ""
+        error = f"mean square {ERROR_WORDS[rest.channel]} over half a second{source}"
+        text = f"a formula removes {format_share(rest.share)} of the {error}"
         return f"{text}: it repeats {enumerate_texts(repeats)}" if repeats else text
     if rest.kind == "lasting":
         whose = "the wheels' " if rest.path == "wheels" else "the "
@@ -246,7 +249,8 @@ def describe_need(run: RunDiagnosis) -> str:
     known, count = len(need.known), len(need.known) + need.open + (need.others + 1 if need.vague else 0)
     verb = "is" if known == 1 else "are"
     who = need.known[0] if known == count == 1 else f"{known} of {count} parameters"
-    sentences = [f"{who} {verb} known within {_GOAL}"]
+    scale = " (a small one: of a usual value)" if need.is_typical else ""
+    sentences = [f"{who} {verb} known within {_GOAL}{scale}"]
     if known == 0 and count == 1:
         sentences = [f"the one parameter is not known within {_GOAL}"]
     if known == count:

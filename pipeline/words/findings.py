@@ -366,14 +366,24 @@ def _format_path(of: Values) -> str:
     return f"{path:.0f} m {source}" if path >= 10.0 else f"{path:.2g} m {source}"  # noqa: PLR2004 - two digits
 
 
+def _format_turning(of: Values) -> str:
+    """The share that was made of the turning that was asked for; empty where none was."""
+    if "turned_rad" not in of:
+        return ""
+    degrees = math.degrees(of["turned_rad"])
+    return f" and {format_share(abs(of['turning']), 0)} of the {degrees:.0f} degrees of turning"
+
+
 def _wheels_stand(of: Values) -> str:
-    return f"the wheels do not turn: they rolled {format_share(of['value'], 0)} of the {_format_path(of)}"
+    rolled = f"{format_share(of['value'], 0)} of the {_format_path(of)}"
+    return f"the wheels do not turn: they rolled {rolled}{_format_turning(of)}"
 
 
 def _body_stands(of: Values) -> str:
     return (
-        f"the vehicle does not move: it covered {format_share(of['value'], 0)} of the {_format_path(of)} and "
-        f"stayed within {of['moved_m']:.2g} m (wheels in the air, blocked, or stopped)"
+        f"the vehicle does not move: it covered {format_share(of['value'], 0)} of the "
+        f"{_format_path(of)}{_format_turning(of)}, and stayed within {of['moved_m']:.2g} m (wheels in the "
+        "air, blocked, or stopped)"
     )
 
 
@@ -455,7 +465,8 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "late, by up to {value:.2f} s: models apply these commands with this delay",
     "digging_in": "the vehicle moved less and less per turn of its wheels: it dug in",
     "spinning": "the wheels turned and the vehicle hardly moved: the wheels spun",
-    "sliding": "the vehicle moved faster than its wheels turned: it slid",
+    "sliding": "the vehicle moved faster than its wheels turned: it slid, or, where it is back at once, its "
+    "localization jumped",
     "wheels_delay": "the encoders are {value:ms} late against the gyro (a filter or a clock): corrected",
     "pose_latency": "the latency of poses varies by {value:.2g} s: corrected with gyro and path",
     "pose_outliers": "{value:.3g} s excluded: the localization contradicts the wheels there",
@@ -1045,7 +1056,7 @@ def _pose_angle(of: Values) -> str:
     side = "left" if of["value"] > 0.0 else "right"
     return (
         f"the body moves {abs(math.degrees(of['value'])):.1f} degrees (±{of['half_deg']:.2g}) to the {side} "
-        f"of the headings of {of['pose']}: their frame is turned, or the body crabs, as on a bent axle or "
+        f"of the headings of {of['pose']}: their frame is turned, or the body crabs or drifts, as on a bent axle or "
         f"along a slope; no other signal tells which (heading_deg = {of['heading_deg']:.1f} under [pose] in "
         "run.toml turns it)"
     )

@@ -200,6 +200,12 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
     assert repr(diagnosis).startswith(f"{diagnosis.verdict}\n")
 
 
+def test_a_run_has_the_verdict_of_a_diagnosis_that_was_made_later(
+    run: slip.Run, diagnosis: slip.Diagnosis
+) -> None:
+    assert slip.load(run.name, results=find_results(run)).verdict == diagnosis.verdict
+
+
 def test_what_is_wrong_is_said_in_one_line(run: slip.Run) -> None:
     for act, line in [
         (lambda _: slip.effect("effectiv_track"), "no effect is called 'effectiv_track'"),

@@ -278,6 +278,20 @@ def test_a_name_needs_more_evidence_than_in_a_finished_log_and_a_second_look() -
     assert [one["effect"] for one in list_known(weak, None)] == ["effective_track"]
 
 
+def test_a_wide_interval_and_a_guessed_vehicle_are_told_as_such() -> None:
+    wide, narrow = name("effective_track", 50.0, 1.2), name("drive_gain", 50.0, 0.02)
+    guess = {"id": "vehicle_fitted", "severity": "warning", "where": "vehicle"}
+    values = {"kind": "wheels alone", "assumed": {"wheel_radius_m": 0.1}}
+    narrow = msgspec.structs.replace(narrow, parameters={"g": Number(0.8, 0.79, 0.81)})
+    answer = {"findings": [{**guess, "values": values}]}
+    shown = format_watch(
+        {"log": "run.mcap", "closed": False, **summarize(answer, RunDiagnosis(effects=(wide, narrow)), None)}
+    )
+    assert shown[2] == "known     drive_gain: g 0.800 [0.790, 0.810]"
+    assert shown[3] == "open      effective_track: k 1.8 [0.6, 3.0], not yet known"
+    assert [line.startswith("vehicle   no vehicle is given") for line in shown].count(True) == 1
+
+
 def test_it_asks_until_it_knows_enough() -> None:
     known = name("effective_track", 50.0, 0.02)
     errors = Step(effects=("effective_track",), t_mrmse_m=0.01, r_mrmse_rad=0.01)

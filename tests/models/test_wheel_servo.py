@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import EstimationData, Input, fit_model
-from pipeline.models import Model, find_effect, predict_step
+from pipeline.models import Asked, Model, find_effect, predict_step
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import JointDrive
 from pipeline.run.heading import Grid, average_held
@@ -204,3 +204,12 @@ def test_its_sentence_is_what_the_whole_drive_makes_of_a_step() -> None:
     turned = predict_step(vehicle, beside, 0.0, seen["turn"], 2.0).w[-1] / seen["turn"]
     assert seen["turned"] == pytest.approx(turned)
     assert 0.0 < seen["turned"] < alone["turned"]
+
+
+def test_its_sentence_speaks_of_what_the_run_asked_for() -> None:
+    vehicle, servo = vehicle_of("husky_a200"), find_effect("wheel_servo")(**SERVO)
+    said = servo.describe_motion(vehicle, (servo,), Asked(0.6, 1.0))
+    assert "of 0.6 m/s" in said
+    assert "at 1 rad/s" in said
+    assert "turn" not in servo.describe_clause(vehicle, (servo,), Asked(0.6, 0.0))
+    assert "m/s" not in servo.describe_motion(vehicle, (servo,), Asked(0.0, 1.0))

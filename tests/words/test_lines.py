@@ -9,6 +9,7 @@ from pipeline.models import Number, name_term
 from pipeline.recording import Finding
 from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained
 from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
+from pipeline.words.effects import describe_clause
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
 MANY = (
@@ -152,3 +153,27 @@ def test_motion_that_lasts_is_one_short_sentence() -> None:
 )
 def test_a_length_has_the_unit_that_people_read(metres: float, text: str) -> None:
     assert format_length(metres) == text
+
+
+def test_a_number_that_is_hardly_known_is_no_number_of_the_verdict() -> None:
+    drawn = draw_diagnosis(
+        {"clock_offset": {"d": 0.47}, "contact_friction": {"friction": 0.5}}, [(1.0, 0.5)] * 3
+    )
+    clock, friction = drawn.effects
+    known = replace(clock, parameters={"d": Number(0.47, 0.45, 0.49, "s")})
+    wide = replace(clock, parameters={"d": Number(0.47, 0.14, 0.74, "s")})
+    assert describe_clause(known, drawn) == "the poses are stamped 0.47 s late"
+    assert describe_clause(wide, drawn) == "the poses are stamped 0.14 to 0.74 s late"
+    assert format_short(wide) == "d = 0.47 s [0.14, 0.74], not yet known"
+    friction = replace(friction, parameters={"friction": Number(0.5, 0.1, 0.9), "k": Number(1.7, 1.6, 1.8)})
+    assert "0.5" not in describe_clause(friction, drawn)
+
+
+def test_what_a_dead_encoder_makes_is_no_fact_beside_it() -> None:
+    stretch = {"side": "left", "reads": "zero"}
+    values = {"stretches": [stretch], "witnesses": ["pose"], "line": "ignore = [[0, 9]]"}
+    dead, stuck = Finding("encoder_dead", "warning", "wheels", values), Finding("stuck", "warning")
+    shown = [text for _, text in list_findings({"run": [dead, stuck]}, "", everything=True)]
+    assert [text.startswith("!  perhaps by the dead encoder: ") for text in shown] == [False, True]
+    (alone,) = list_findings({"run": [stuck]}, "", everything=True)
+    assert "dead" not in alone[1]

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, find_effect, list_effects
-from pipeline.results import Errors, RunDiagnosis, Unexplained, read_result
+from pipeline.models import Model, ModelFile, Number, find_effect, list_effects
+from pipeline.results import Errors, Named, RunDiagnosis, Unexplained, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main
 from pipeline.sources import list_presets
 from pipeline.sources.one_vehicle import load_vehicle
@@ -27,12 +27,18 @@ _PRESETS = {vehicle.id: vehicle for vehicle in list_presets()}
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
-def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
+def test_what_people_act_on_is_no_smaller_effect() -> None:
+    """A clock that was corrected has no step; late commands and flat tyres may make little error in a run."""
     errors = [(1.0, 0.5), (0.1, 0.1), (0.05, 0.1)]
-    ladder = draw_diagnosis({"drive_lag": {"tau": 0.3}, "deadband": {"d": 0.01}}, errors).ladder
-    lag, band, clock = ("drive_lag", False), ("deadband", False), ("clock_offset", True)
-    assert split_main([lag, band, clock], ladder, lambda one: one) == ([lag, clock], [band])
-    assert split_main([band, clock], ladder, lambda one: one) == ([band, clock], [])
+    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}, "deadband": {"d": 0.01}}, errors)
+    lag, band = drawn.effects
+    clock = Named("clock_offset", {"d": Number(0.1)}, corrected=True)
+    late = Named("transport_delay", {"d": Number(0.4, 0.38, 0.42, "s")})
+    flat, round_ = (Named("wheel_radius", {"k": Number(k, k - 0.01, k + 0.01)}) for k in (0.85, 0.98))
+    vague = Named("transport_delay", {"d": Number(0.4, 0.01, 0.8, "s")})
+    effects = [lag, band, clock, late, flat, round_, vague]
+    assert split_main(effects, drawn.ladder) == ([lag, clock, late, flat], [band, round_, vague])
+    assert split_main([band, clock], drawn.ladder) == ([band, clock], [])
 
 
 def test_every_effect_reads_well_in_a_verdict() -> None:

@@ -39,7 +39,7 @@ from pipeline.core import Floats
 from pipeline.models.effect import INF, Effect, Excitation, Least, Parameter, Place, Plausible, Search
 from pipeline.models.families import TIME_CONSTANT
 from pipeline.models.model import JointDrive
-from pipeline.models.parameter import Conditions, Largest, Level, Quantity
+from pipeline.models.parameter import Asked, Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
 from pipeline.models.step import STEP_CELL_S, predict_step
 from pipeline.run import HORIZON_S, RunContext, Wheels
@@ -60,7 +60,7 @@ _OTHER_RIM = 1.5
 _ALIKE_AT, _SLOPES = 3.0, (0.5, 0.7, 1.4, 2.0)
 """Speed [m/s] at which other motors have the same force, and how fast theirs falls, by that of this one."""
 _STEP_MPS, _WATCHED_S = 1.0, 5.0
-"""Step of the command by which it is described [m/s], and how long it is watched straight ahead [s]."""
+"""Step of the command that describes it without a run [m/s], and how long it is watched [s]."""
 _RISEN, _NEARLY_ALL = 1.0 - math.exp(-1.0), 0.98
 """Share of a step after one time constant, and share that counts as all of it."""
 _TINY = 1e-6
@@ -243,25 +243,35 @@ class WheelServo(JointDrive):
             for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
         ]
 
-    def list_seen(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> dict[str, float]:
+    def list_seen(
+        self, vehicle: Vehicle, beside: Iterable[Effect] = (), asked: Asked | None = None
+    ) -> dict[str, float]:
         """What the whole drive makes of a step of the command from rest, straight ahead and on the spot.
+
+        The steps are the largest that the run asks for; without a run, one speed of either side.
 
         Returns:
             ``asked``, the speed of the step [m/s]; ``rise``, time to 63 % of it straight ahead [s], NaN where
-            it is not reached; ``turn``, the yaw rate with that speed of either side [rad/s]; ``turned``, the
-            share of it that the wheels have after two seconds, NaN where it is nearly all.
+            it is not reached; ``turn``, the yaw rate of the step on the spot [rad/s]; ``turned``, the share
+            of it that the wheels have after two seconds, NaN where it is nearly all, or where the run does
+            not turn on the spot.
         """
         step = min(_STEP_MPS, vehicle.max_speed_mps or math.inf)
         turn = 2.0 * step / vehicle.kinematics.turning_width_m(vehicle)
+        if asked is not None:
+            step, turn = asked.speed_mps, asked.turn_radps
         seen = {"asked": step, "rise": math.nan, "turn": turn, "turned": math.nan}
         if self.is_neutral or any(map(math.isnan, self.values.values())):
             return seen
         drive = [one for one in beside if one.place <= Place.DRIVE and one.id != self.id]
-        straight = predict_step(vehicle, [*drive, self], step, 0.0, _WATCHED_S).x / step
-        if straight.max() >= _RISEN:
-            seen["rise"] = float(np.argmax(straight >= _RISEN) + 1) * STEP_CELL_S
-        turned = float(predict_step(vehicle, [*drive, self], 0.0, turn, HORIZON_S).w[-1]) / turn
-        return seen | ({"turned": turned} if turned < _NEARLY_ALL else {})
+        if step > 0.0:
+            straight = predict_step(vehicle, [*drive, self], step, 0.0, _WATCHED_S).x / step
+            if straight.max() >= _RISEN:
+                seen["rise"] = float(np.argmax(straight >= _RISEN) + 1) * STEP_CELL_S
+        if turn > 0.0:
+            turned = float(predict_step(vehicle, [*drive, self], 0.0, turn, HORIZON_S).w[-1]) / turn
+            seen |= {"turned": turned} if turned < _NEARLY_ALL else {}
+        return seen
 
     def list_numbers(self, track_m: float, imbalance: float) -> Floats:
         """The numbers of `walk_each`."""
