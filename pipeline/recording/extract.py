@@ -181,6 +181,12 @@ class Extraction:
         configuration = msgspec.structs.replace(self.configuration, **sections)
         return type(self)(Given(self.log, self.sources, configuration, self.vehicle, self.where))
 
+    def take_track(self, number: int) -> Self:
+        """The same log with one of the tracks between which its poses alternate."""
+        pose = self.sources.pose and replace(self.sources.pose, track=number)
+        sources = replace(self.sources, pose=pose)
+        return type(self)(Given(self.log, sources, self.configuration, self.vehicle, self.where))
+
     def run(self) -> Extracted:
         """All tables."""
         tables = {"poses": self.poses(), "commands": self._commands, "wheels": self._wheels}
@@ -296,6 +302,16 @@ class Extraction:
             self.findings.append(Finding("interval_applied", "info", source.topic, counted))
         return spans
 
+    def find_tracks(self) -> pose_topics.Tracks | None:
+        """Tracks between which the recorded poses alternate; None of one track."""
+        if self.sources.pose is None or self.sources.pose.wheels is not None:
+            return None
+        stamp, _, arrays, _ = self._recorded_poses(self.sources.pose)
+        return self._find_tracks(self._seconds(stamp), arrays.position)
+
+    def _find_tracks(self, times: Floats, position: Floats) -> pose_topics.Tracks | None:
+        return self.log.once(pose_topics.find_tracks, times, position, self.configuration.velocity.jump_m)
+
     def poses(self) -> pl.DataFrame:
         """Table of the poses, upright and cut into segments."""
         source, spans = self.sources.pose, self._spans
@@ -303,6 +319,10 @@ class Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
+        if source.track:
+            rows = pose_topics.choose_track(self._find_tracks(times, arrays.position), source)
+            stamp, log_time, arrays, times = stamp[rows], log_time[rows], arrays.take(rows), times[rows]
+            breaks = np.diff(np.cumsum(breaks)[rows], prepend=0) > 0
         position, quaternion, leant = topic_values.put_upright(arrays, self.configuration.pose)
         if leant:
             leaning = {"lean_deg": float(np.degrees(leant))}

@@ -286,7 +286,9 @@ def list_wanted(
         )
         for topic, fields in by_topic.items()
     ]
-    return wanted + _list_wanted_transforms(every, types)
+    return wanted + [
+        one for one in _list_wanted_transforms(every, types) if not one.topic.startswith(sources.other_robots)
+    ]
 
 
 def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:

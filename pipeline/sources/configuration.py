@@ -233,6 +233,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             capture, ``-y`` of a camera's optical frame.
         heading_deg: angle from the recorded heading to the vehicle's own [degrees], counterclockwise.
         unit: of the positions; by default metres.
+        track: which of the tracks of two publishers on one topic, by their first poses.
         time: which of the message's times to use.
     """
 
@@ -247,6 +248,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
     heading_deg: Annotated[float, msgspec.Meta(ge=-360.0, le=360.0)] | None = None
     unit: Literal["m", "cm", "mm"] | None = None
+    track: Literal[1, 2] | None = None
     time: Clock | None = None
 
 
