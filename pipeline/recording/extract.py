@@ -302,14 +302,14 @@ class Extraction:
             self.findings.append(Finding("interval_applied", "info", source.topic, counted))
         return spans
 
-    def find_tracks(self) -> pose_topics.Tracks | None:
-        """Tracks between which the recorded poses alternate; None of one track."""
+    def find_tracks(self) -> Ints | None:
+        """Number of each recorded pose's track, of two between which they alternate; None of one track."""
         if self.sources.pose is None or self.sources.pose.wheels is not None:
             return None
         stamp, _, arrays, _ = self._recorded_poses(self.sources.pose)
         return self._find_tracks(self._seconds(stamp), arrays.position)
 
-    def _find_tracks(self, times: Floats, position: Floats) -> pose_topics.Tracks | None:
+    def _find_tracks(self, times: Floats, position: Floats) -> Ints | None:
         return self.log.once(pose_topics.find_tracks, times, position, self.configuration.velocity.jump_m)
 
     def poses(self) -> pl.DataFrame:

@@ -229,23 +229,10 @@ def _find_pose_jumps(
     return jumps
 
 
-@dataclass(frozen=True)
-class Tracks:
-    """Two tracks between which poses alternate, as of two publishers on one topic.
-
-    Attributes:
-        number: of the track of each pose, 1 or 2 by their first poses, shape (n,).
-        is_clear: whether nearly every pose lies far nearer to one of them than to the other.
-    """
-
-    number: Ints
-    is_clear: bool
-
-
 _BACK = 10
 """Largest number of poses of one publisher between two of the other, both counted."""
 _ALTERNATES = 0.1
-"""Share of steps between the tracks from which on poses alternate: fewer are poses that lie apart."""
+"""Share of steps between the tracks from which on poses alternate: fewer lie apart, or are noise."""
 _RETURNS = (0.2, 0.6)
 """A pose returns if it lies nearer to one before the last than this part of its step; so do this many of the
 steps between tracks. Of poses that are noise one in three returns by chance."""
@@ -257,13 +244,18 @@ _GOES_ON_S = (0.02, 0.5)
 """Times [s] between two poses of a track that show its velocity."""
 
 
-def find_tracks(times: Floats, position: Floats, smallest_m: float) -> Tracks | None:
-    """Two tracks between which poses jump to and fro; None of a body's own poses.
+def find_tracks(times: Floats, position: Floats, smallest_m: float) -> Ints | None:
+    """Two tracks between which poses jump to and fro, as of two publishers; None of a body's own poses.
+
+    Nearly every pose lies far nearer to one of them than to the other.
 
     Args:
         times: stamps [s], not decreasing, shape (n,).
         position: [m], shape (n, 3).
         smallest_m: smallest jump [m].
+
+    Returns:
+        Number of the track of each pose, 1 or 2 by their first poses, shape (n,).
     """
     known = np.flatnonzero(np.isfinite(position[:, :2]).all(axis=1))
     places = position[known, 0] + 1j * position[known, 1]
@@ -279,9 +271,11 @@ def find_tracks(times: Floats, position: Floats, smallest_m: float) -> Tracks | 
     # The second track begins where the poses went that came back first.
     begins = int(far[np.searchsorted(far, np.flatnonzero(returns)[0]) - 1])
     number, is_unclear = _follow_tracks(times[known].tolist(), places.tolist(), begins, smallest_m)
+    if np.mean(is_unclear) > _MOST_UNCLEAR or np.mean(np.diff(number) != 0) < _ALTERNATES:
+        return None
     numbers = np.ones(position.shape[0], dtype=np.int64)
     numbers[known] = number
-    return Tracks(numbers, float(np.mean(is_unclear)) <= _MOST_UNCLEAR)
+    return numbers
 
 
 def _follow_tracks(
@@ -307,7 +301,7 @@ def _follow_tracks(
     return number, is_unclear
 
 
-def choose_track(tracks: Tracks | None, source: PoseSource) -> Ints:
+def choose_track(tracks: Ints | None, source: PoseSource) -> Ints:
     """Rows of the poses of one track.
 
     Raises:
@@ -316,7 +310,7 @@ def choose_track(tracks: Tracks | None, source: PoseSource) -> Ints:
     if tracks is None:
         what = f"run.toml names a track, and the poses of {source} do not alternate between two of them"
         raise StageError("no_track", what, where=source.topic, hint="Leave out `track` of [pose].")
-    return np.flatnonzero(tracks.number == source.track)
+    return np.flatnonzero(tracks == source.track)
 
 
 _APART = 3

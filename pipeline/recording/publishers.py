@@ -56,13 +56,13 @@ def ask_tracks(case: Case) -> Case:
     why = "both" if less > _UNLIKE * most else "told" if most else "neither"
     number = 1 + shares.index(max(shares))
     values = {
-        "kind": why if tracks.is_clear else "together",
+        "kind": why,
         "frames": [*case.extraction.frames] if all(case.extraction.frames) else [],
         "source": str(pose),
         "by": by,
         "number": number,
     }
-    if values["kind"] == "told":
+    if why == "told":
         case.findings.append(Finding("track_taken", "warning", "pose", values))
     else:
         case.findings.append(Finding("tracks_mixed", "error", "pose", values))

@@ -1210,11 +1210,6 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "tracks_mixed": {
         "both": partial(_tracks, rest=f"both of which follow what drives the vehicle: {_NO_TRACK}"),
         "neither": partial(_tracks, rest=f"neither of which follows what drives the vehicle: {_NO_TRACK}"),
-        "together": partial(
-            _tracks,
-            rest="which lie too near to each other, or are too many, to be told apart: "
-            f"{_ONE_TRACK}, and record anew",
-        ),
     },
     "motor_reversed": _motor_reversed,
     "wheel_dead": _wheel_dead,
