@@ -134,11 +134,11 @@ class TruthSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     Attributes:
         distance_m: distance between start and end of a straight drive by a tape, to 5 mm or 0.5 %.
-        turns: whole and part turns on the spot as counted, to a tenth.
+        turns: whole and part turns on the spot as counted, to a tenth; those to either side add up.
     """
 
     distance_m: Annotated[float, msgspec.Meta(ge=1e-3, le=1e5)] | None = None
-    turns: Annotated[float, msgspec.Meta(ge=1e-3, le=1e4)] | None = None
+    turns: Annotated[float, msgspec.Meta(ge=0.25, le=1e4)] | None = None
 
 
 class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
