@@ -181,9 +181,8 @@ class Extraction:
         configuration = msgspec.structs.replace(self.configuration, **sections)
         return type(self)(Given(self.log, self.sources, configuration, self.vehicle, self.where))
 
-    def take_track(self, number: int) -> Self:
-        """The same log with one of the tracks between which its poses alternate."""
-        pose = self.sources.pose and replace(self.sources.pose, track=number)
+    def take_pose(self, pose: PoseSource) -> Self:
+        """The same log with other poses, or one of the tracks between which they alternate."""
         sources = replace(self.sources, pose=pose)
         return type(self)(Given(self.log, sources, self.configuration, self.vehicle, self.where))
 

@@ -46,7 +46,7 @@ def ask_tracks(case: Case) -> Case:
         return case
     drives = {"command": case.sources.command, "wheels": case.sources.wheels}
     readings = [case.read(one, is_measured=role == "wheels") for role, one in drives.items() if one]
-    each = [case.extraction.take_track(number) for number in (1, 2)]
+    each = [case.extraction.take_pose(replace(pose, track=number)) for number in (1, 2)]
     shares = []
     for extraction in each:
         motion = measure_motion(extraction.poses())

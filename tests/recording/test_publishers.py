@@ -164,3 +164,43 @@ def test_noise_jumps_and_single_outliers_are_no_second_track() -> None:
     found = find_tracks(time, mixed, 0.1)
     assert found is not None
     assert found[:6].tolist() == [1, 1, 2, 1, 1, 2]
+
+
+def record_localization(drive: DrawnDrive) -> DrawnTopic:
+    """Poses of a body that turns less than its wheels say."""
+    yaw = drive.yaw / 1.3
+    x, y = (np.cumsum(drive.speed * part) * STEP_S for part in (np.cos(yaw), np.sin(yaw)))
+    x, y = np.stack((x, y)) + np.random.default_rng(5).normal(scale=0.01, size=(2, x.size))
+    fields = {"header.frame_id": "map"} | replace(drive, x=x, y=y, yaw=yaw).pose("pose.")
+    return record_cdr(drive, "/lio/pose", "geometry_msgs/msg/PoseStamped", fields)
+
+
+def record_odometry(drive: DrawnDrive, late_s: float = 0.0, per_rad: float = 1.0) -> DrawnTopic:
+    """Odometry with the speeds of the wheels, whose yaw rate may be in another unit."""
+    fields = {"header.frame_id": "odom", "child_frame_id": "base_link"} | drive.pose("pose.pose.")
+    fields |= {"twist.twist.linear.x": drive.speed, "twist.twist.angular.z": per_rad * drive.turn}
+    made = record_cdr(drive, "/odom", "nav_msgs/msg/Odometry", fields)
+    return replace(made, times=made.times + int(1e9 * late_s))
+
+
+def test_speeds_that_two_publishers_send_by_turns_are_not_used(tmp_path: Path) -> None:
+    drive = draw_drive(90.0)
+    poses = record_localization(drive)
+    both = [record_odometry(drive), record_odometry(drive_other(drive), 0.017)]
+    log = write_drawn(tmp_path / "log.mcap", record_twist(drive), poses, *both)
+    assert "two publishers send on it by turns" in read_findings(log)["numbers_not_used"]
+    with pytest.raises(SlipError, match="hold no 'wheels'"):
+        extract_drawn(log, "wheels")
+
+
+def test_the_unit_of_speeds_is_that_by_which_their_own_pose_moves(tmp_path: Path) -> None:
+    drive = draw_drive(90.0)
+    poses = record_localization(drive)
+    odometry = record_odometry(drive, per_rad=180.0 / np.pi)
+    log = write_drawn(tmp_path / "log.mcap", record_twist(drive), poses, odometry)
+    text = read_findings(log)["wheels_corrected"]
+    assert "the yaw rate of /odom is in deg/s" in text
+    assert 'yaw_unit = "deg/s" under [wheels]' in text
+    (tmp_path / "given").mkdir()
+    again = write_drawn(tmp_path / "given" / "log.mcap", record_twist(drive), poses, odometry)
+    assert "wheels_corrected" not in read_findings(again, wheels={"yaw_unit": "deg/s"})
