@@ -176,7 +176,12 @@ def list_changes() -> list[Change]:
         Change("left encoder counts double", _on_wheels(2.0, 1.0), "counts? 2 times|low against the other"),
         Change("positions of the wheels in turns", _on_joints(_turn, "position"), "position"),
         Change("a counter of the wheels jumps", _on_joints(_jump, "position"), "jump"),
-        Change("wheels stamped in whole seconds", _stamp_coarsely, "whole seconds|share their|log times"),
+        Change("counters of the wheels run over", _on_joints(_run_over, "position"), "jump"),
+        Change("wheels stamped in whole seconds", _stamp_coarsely("wheels"), "whole seconds|log times"),
+        Change("poses stamped in whole seconds", _stamp_coarsely("pose"), "whole seconds|log times"),
+        Change("commands stamped in whole seconds", _stamp_coarsely("command"), "whole seconds|log times"),
+        Change("frames with a prefix", _prefix_frames),
+        Change("another robot's poses on the topic", _mix_poses, "two publishers"),
         Change("in a namespace, beside another robot", _name_robots, "robots?"),
         Change("wheels in rpm", _on_wheels(30.0 / math.pi, 30.0 / math.pi), "rpm"),
         Change("wheels x 3", _on_wheels(3.0, 3.0), "radius|unit"),
@@ -300,17 +305,79 @@ _HALF = 0.5
 """Part of a log after which a counter has jumped."""
 
 
-def _stamp_coarsely(log: Log, roles: Roles) -> Log | None:
-    """Wheels stamped by a clock that counts seconds."""
+def _run_over(value: float, _: float) -> float:
+    return (value + _FULL_RAD) % (2.0 * _FULL_RAD) - _FULL_RAD
 
-    def change(one: Message) -> Message:
-        if one.topic not in roles.wheels:
-            return one
-        content = _copy(one.content)
-        content["header"]["stamp"]["nanosec"] = 0
-        return replace(one, content=content)
 
-    return _each(log, change) if _joints(log, roles) else None
+_FULL_RAD = 2.0 * math.pi * 32768.0 / 2048.0
+"""Angle [rad] at which a counter of 16 bits runs over, which counts 2048 a turn."""
+
+
+def _stamp_coarsely(role: str) -> Callable[[Log, Roles], Log | None]:
+    """The topics of a role stamped by a clock that counts seconds."""
+
+    def make(log: Log, roles: Roles) -> Log | None:
+        topics = {"wheels": roles.wheels, "pose": (roles.pose,), "command": roles.command}[role]
+
+        def change(one: Message) -> Message:
+            if one.topic not in topics:
+                return one
+            content = _copy(one.content)
+            for stamp in _list_stamps(content):
+                stamp["nanosec"] = 0
+            return replace(one, content=content)
+
+        known = [_copy(one.content) for one in log.messages if one.topic in topics]
+        return _each(log, change) if any(True for one in known for _ in _list_stamps(one)) else None
+
+    return make
+
+
+def _prefix(content: Content, space: str) -> Content:
+    """A message with its frames in a namespace."""
+    if isinstance(content, dict):
+        return {
+            name: f"{space}/{value}" if name.endswith("frame_id") and value else _prefix(value, space)
+            for name, value in content.items()
+        }
+    return [_prefix(one, space) for one in content] if isinstance(content, list) else content
+
+
+def _prefix_frames(log: Log, _: Roles) -> Log:
+    """All frames with the prefix of a robot that nothing else names."""
+    return _each(log, lambda one: replace(one, content=_prefix(_copy(one.content), "robot_7")))
+
+
+_BESIDE_M = 25.0
+"""Distance [m] of another robot."""
+_BETWEEN_NS = 7_000_000
+"""Time [ns] by which its poses come after those of the first one."""
+
+
+def _mix_poses(log: Log, roles: Roles) -> Log | None:
+    """On the topic of the poses another robot at a distance, which drives as this one backward in time."""
+    if not _has_pose(log, roles):
+        return None
+    own = [_copy(one.content) for one in log.messages if one.topic == roles.pose]
+    backward = iter([_find_pose(one) for one in reversed(own)])
+    made: list[Message] = []
+    for one in log.messages:
+        made.append(one)
+        if one.topic != roles.pose:
+            continue
+        content, pose = _copy(one.content), next(backward)
+        _find_pose(content).update(
+            pose | {"position": pose["position"] | {"x": pose["position"]["x"] + _BESIDE_M}}
+        )
+        for stamp in _list_stamps(content):
+            stamp |= dict(zip(("sec", "nanosec"), _add(stamp, _BETWEEN_NS), strict=True))
+        times = (one.log_time + _BETWEEN_NS, one.publish_time + _BETWEEN_NS)
+        made.append(Message(one.topic, one.kind, content, *times))
+    return replace(log, messages=made)
+
+
+def _add(stamp: dict[str, int], time_ns: int) -> tuple[int, int]:
+    return divmod(stamp["sec"] * 10**9 + stamp["nanosec"] + time_ns, 10**9)
 
 
 def _name_robots(log: Log, roles: Roles) -> Log | None:
@@ -320,23 +387,15 @@ def _name_robots(log: Log, roles: Roles) -> Log | None:
     if roles.pose not in {one.topic for one in transforms}:
         return None
 
-    def prefix(content: Content, space: str) -> Content:
-        if isinstance(content, dict):
-            return {
-                name: f"{space}/{value}" if name.endswith("frame_id") else prefix(value, space)
-                for name, value in content.items()
-            }
-        return [prefix(one, space) for one in content] if isinstance(content, list) else content
-
     made: list[Message] = []
     standing = {one.topic: _copy(one.content) for one in reversed(transforms)}
     for one in log.messages:
-        content = prefix(_copy(one.content), "robot_b") if one.kind.endswith(framed) else one.content
+        content = _prefix(_copy(one.content), "robot_b") if one.kind.endswith(framed) else one.content
         topic = one.topic if one.topic in standing else f"/robot_b{one.topic}"
         made.append(replace(one, topic=topic, content=content))
         if one.topic in standing:
             stamps = [part["header"]["stamp"] for part in _copy(one.content)["transforms"]]
-            still = prefix(standing[one.topic], "robot_a")
+            still = _prefix(standing[one.topic], "robot_a")
             for part in still["transforms"]:
                 part["header"] = part["header"] | {"stamp": stamps[0]}
             made.append(replace(one, content=still))

@@ -110,6 +110,11 @@ _HELD_INTERVALS: Final = 3.0
 _SMALLEST_LEAD_NS: Final = 1_000_000
 """Time between stamp and recording that means nothing: recorders write down messages a millisecond apart."""
 
+_SHARED: Final = 2.0 / 3.0
+"""Share of poses with the stamp of the one before, and another place, above which stamps are too coarse: two
+publishers that stamp alike share half."""
+_FEWEST_STAMPS: Final = 20
+"""Least number of poses of which that is known."""
 _LONGEST_PATH: Final = 2.0
 """Path between two changes of a correction [m + rad] above which the second one is a jump: AMCL corrects
 every 0.2 m or 0.2 rad, slam_toolbox every 0.5 m or 0.5 rad."""
@@ -314,7 +319,13 @@ class TransformBuffer:
                 )
             if invalid[child]:
                 self._notes.append(f"{invalid[child]} transforms of {child} are invalid and were left out")
-            self._links[child] = _join([link for link in chosen if link.parent == parent])
+            own = [link for link in chosen if link.parent == parent]
+            if _share_stamps(own):
+                self._notes.append(
+                    f"stamps of {shorten(child)} are those of several poses: log times were used"
+                )
+                own = [replace(link, time=link.log_time) for link in own]
+            self._links[child] = _join(own)
 
 
 def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, int]]:
@@ -369,6 +380,17 @@ def _spread(column: Column | None) -> Column | None:
     if isinstance(column, np.ndarray):
         return Ragged(column, np.arange(column.size + 1))
     return column
+
+
+def _share_stamps(links: list[Link]) -> bool:
+    """Whether most stamps are those of several poses that differ, as of a clock that counts seconds."""
+    time = np.concatenate([link.time for link in links])
+    order = np.argsort(time, kind="stable")
+    position, quaternion = (
+        np.concatenate([getattr(link, name) for link in links])[order] for name in ("position", "quaternion")
+    )
+    moves = ~find_held(position, quaternion)[1:] & (np.diff(time[order]) == 0)
+    return not links[0].fixed and moves.size >= _FEWEST_STAMPS and bool(moves.mean() > _SHARED)
 
 
 def _join(links: list[Link]) -> Link:

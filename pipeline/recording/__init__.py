@@ -79,6 +79,7 @@ FAULTS = (
     "command_reversed",
     "command_of_map",
     "commands_mixed",
+    "tracks_mixed",
     "not_driven",
     "pose_contradicts_itself",
     "motor_reversed",

@@ -17,7 +17,7 @@ from pipeline.recording.losses import ask_losses
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS
 from pipeline.recording.odometry import ask_odometry
 from pipeline.recording.outages import ask_outages
-from pipeline.recording.publishers import ask_publishers
+from pipeline.recording.publishers import ask_publishers, ask_tracks
 from pipeline.recording.readings import Reading
 from pipeline.recording.roles import (
     ask_angle,
@@ -110,6 +110,7 @@ def ask_driven(case: Case) -> Case:
 
 QUESTIONS: tuple[Callable[[Case], Case], ...] = (
     # What there is, and in which frame and of whom the motion is.
+    ask_tracks,
     ask_odometry,
     ask_motion,
     ask_legs,
@@ -163,7 +164,7 @@ def examine(given: Given) -> Recording:
             case = ask(case)
             if case.refused is not None:
                 return replace(as_given, refused=case.refused)
-            if ask is not ask_odometry and not case.motion.is_known:
+            if ask not in {ask_tracks, ask_odometry} and not case.motion.is_known:
                 return as_given
     except SlipError:
         if given.sources.pose is None:

@@ -181,6 +181,11 @@ class Extraction:
         configuration = msgspec.structs.replace(self.configuration, **sections)
         return type(self)(Given(self.log, self.sources, configuration, self.vehicle, self.where))
 
+    def take_pose(self, pose: PoseSource) -> Self:
+        """The same log with other poses, or one of the tracks between which they alternate."""
+        sources = replace(self.sources, pose=pose)
+        return type(self)(Given(self.log, sources, self.configuration, self.vehicle, self.where))
+
     def run(self) -> Extracted:
         """All tables."""
         tables = {"poses": self.poses(), "commands": self._commands, "wheels": self._wheels}
@@ -296,6 +301,16 @@ class Extraction:
             self.findings.append(Finding("interval_applied", "info", source.topic, counted))
         return spans
 
+    def find_tracks(self) -> Ints | None:
+        """Number of each recorded pose's track, of two between which they alternate; None of one track."""
+        if self.sources.pose is None or self.sources.pose.wheels is not None:
+            return None
+        stamp, _, arrays, _ = self._recorded_poses(self.sources.pose)
+        return self._find_tracks(self._seconds(stamp), arrays.position)
+
+    def _find_tracks(self, times: Floats, position: Floats) -> Ints | None:
+        return self.log.once(pose_topics.find_tracks, times, position, self.configuration.velocity.jump_m)
+
     def poses(self) -> pl.DataFrame:
         """Table of the poses, upright and cut into segments."""
         source, spans = self.sources.pose, self._spans
@@ -303,6 +318,10 @@ class Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
+        if source.track:
+            rows = pose_topics.choose_track(self._find_tracks(times, arrays.position), source)
+            stamp, log_time, arrays, times = stamp[rows], log_time[rows], arrays.take(rows), times[rows]
+            breaks = np.diff(np.cumsum(breaks)[rows], prepend=0) > 0
         position, quaternion, leant = topic_values.put_upright(arrays, self.configuration.pose)
         if leant:
             leaning = {"lean_deg": float(np.degrees(leant))}

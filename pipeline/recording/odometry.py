@@ -3,17 +3,19 @@
 It is asked before units, clocks and roles: what a message contradicts by itself is of no other topic.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 
-from pipeline.core import Floats, rigid
+from pipeline.core import Floats, SlipError, rigid
 from pipeline.recording.case import Case
 from pipeline.recording.evidence import RATES, SPEEDS
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import FEWEST_STEPS, find_one_ratio
 from pipeline.recording.readings import Held, Reading
-from pipeline.sources import LENGTH_UNITS, DriveForm, PoseContent
+from pipeline.sources import LENGTH_UNITS, DriveForm, DriveSource, PoseContent, PoseSource
 
 _APART = 4.0
 """Ratio of pose and speeds from which on one of them is wrong: skidding wheels turn a body a quarter as far
@@ -29,15 +31,32 @@ def ask_odometry(case: Case) -> Case:
     command tells which of them is wrong, without one the usual speed of a vehicle, a metre or radian a
     second.
     """
-    pose = case.sources.pose
-    of_pose = [
-        one for one in case.sources.rank_drives("wheels") if pose and one.signals[0].topic == pose.topic
-    ]
-    source = next((one for one in of_pose if one.form is DriveForm.BODY), None)
-    if pose is None or source is None or pose.content is not PoseContent.POSE:
+    poses = [case.sources.pose, *case.sources.others.get("pose", ())]
+    by_topic = {
+        one.topic: one for one in poses if isinstance(one, PoseSource) and one.content is PoseContent.POSE
+    }
+    for source in case.sources.rank_drives("wheels"):
+        pose = by_topic.get(source.signals[0].topic)
+        if source.form is DriveForm.BODY and pose is not None and case.refused is None:
+            case = _compare(case, source, pose)
+    return case
+
+
+def _compare(case: Case, source: DriveSource, pose: PoseSource) -> Case:
+    """The case without what the pose and the speeds of one topic contradict."""
+    is_used = pose == case.sources.pose
+    try:
+        extraction = case.extraction if is_used else case.extraction.take_pose(pose)
+        is_mixed = not is_used and extraction.find_tracks() is not None
+        times, moved, turned = _list_changes(extraction.poses())
+    except SlipError:
         return case
+    if is_mixed:
+        # The speeds of two bodies are told apart by the poses that are sent with them.
+        what = {"what": f"{source}: two publishers send on it by turns, whose poses go along two tracks"}
+        case.findings.append(Finding("numbers_not_used", "warning", "wheels", what))
+        return case.leave_out(source)
     twist = case.read(source, is_measured=True)
-    times, moved, turned = _list_changes(case)
     if times.size < FEWEST_STEPS:
         return case
     ratios = [_find_ratio(*each) for each in ((times, moved, twist.first), (times, turned, twist.second))]
@@ -48,6 +67,8 @@ def ask_odometry(case: Case) -> Case:
         and not any(_is_near(ratio, one) for one in of)
         for ratio, of in zip(ratios, units, strict=True)
     ]
+    if not (any(wrong) or is_used) and source == case.sources.wheels:
+        _correct_units(case, source, ratios)
     if not any(wrong):
         return case
     axis = 1 if wrong[1] else 0
@@ -63,14 +84,24 @@ def ask_odometry(case: Case) -> Case:
     }
     finding = Finding("odometry_contradicts_itself", "warning", "pose", values)
     if is_pose:
-        return replace(case, refused=finding)
+        return replace(case, refused=finding) if is_used else case
     case.findings.append(finding)
     return case.leave_out(source)
 
 
-def _list_changes(case: Case) -> tuple[Floats, Floats, Floats]:
+def _correct_units(case: Case, source: DriveSource, ratios: Sequence[float | None]) -> None:
+    """Units of speeds that are sent with a pose which moves as they say, but for a unit."""
+    each = (("unit", "speed", "m/s", SPEEDS), ("yaw_unit", "yaw rate", "rad/s", RATES))
+    for (key, what, usual, factors), ratio in zip(each, ratios, strict=True):
+        names = [name for name, one in factors.items() if ratio is not None and _is_near(ratio, one)]
+        if usual not in names and len(names) == 1:
+            values = {"what": what, "source": str(source), "unit": names[0], "is_sure": True}
+            line = f'{key} = "{names[0]}"'
+            case.correct("wheels", "unit of a drive", values, line, {key: names[0]}, usual="m/s")
+
+
+def _list_changes(poses: pl.DataFrame) -> tuple[Floats, Floats, Floats]:
     """Times of messages [s], and how far the pose moves [m] and turns [rad] up to each, shape (n,) each."""
-    poses = case.extraction.poses()
     times = poses["t"].to_numpy()
     quaternion = poses.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     turned = rigid.wrap_angle(np.diff(rigid.euler_from_quaternions(quaternion)[2]))

@@ -20,7 +20,7 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError, arrays, fit_robustly, format_share, rigid
 from pipeline.recording.drive import read_speed
-from pipeline.recording.extract import Given, extract_tables
+from pipeline.recording.extract import Extracted, Extraction, Given
 from pipeline.recording.findings import Finding
 from pipeline.recording.pose_topics import SLOW_HZ
 from pipeline.recording.satellite import estimate_noise
@@ -165,9 +165,18 @@ def _are_copies(one: PoseRating, other: PoseRating) -> bool:
 def _rate(given: Given, pose: PoseSource) -> PoseRating:
     alone = replace(given.sources, pose=pose, interval=None)
     try:
-        made = extract_tables(replace(given, sources=alone))
+        extraction = Extraction(replace(given, sources=alone))
+        if not pose.track and extraction.find_tracks() is not None:
+            # Poses of two publishers are as good as those of the better one.
+            each = [_rate(given, replace(pose, track=number)) for number in (1, 2)]
+            return replace(max(each, key=lambda one: (not one.refusal, one.score)), source=pose)
+        made = extraction.run()
     except SlipError as error:
         return PoseRating(pose, refusal=error.what)
+    return _rate_extracted(given, pose, made)
+
+
+def _rate_extracted(given: Given, pose: PoseSource, made: Extracted) -> PoseRating:
     poses = made.tables["poses"].filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
     parent, child = made.frames
     bare = PoseRating(pose, parent, child)

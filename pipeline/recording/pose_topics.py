@@ -229,6 +229,90 @@ def _find_pose_jumps(
     return jumps
 
 
+_BACK = 10
+"""Largest number of poses of one publisher between two of the other, both counted."""
+_ALTERNATES = 0.1
+"""Share of steps between the tracks from which on poses alternate: fewer lie apart, or are noise."""
+_RETURNS = (0.2, 0.6)
+"""A pose returns if it lies nearer to one before the last than this part of its step; so do this many of the
+steps between tracks. Of poses that are noise one in three returns by chance."""
+_NEARER = 0.5
+"""Distance to a pose's own track over that to the other, up to which it is clear whose it is."""
+_MOST_UNCLEAR = 0.02
+"""Share of poses that may be unclear, as where bodies pass each other."""
+_GOES_ON_S = (0.02, 0.5)
+"""Times [s] between two poses of a track that show its velocity."""
+
+
+def find_tracks(times: Floats, position: Floats, smallest_m: float) -> Ints | None:
+    """Two tracks between which poses jump to and fro, as of two publishers; None of a body's own poses.
+
+    Nearly every pose lies far nearer to one of them than to the other.
+
+    Args:
+        times: stamps [s], not decreasing, shape (n,).
+        position: [m], shape (n, 3).
+        smallest_m: smallest jump [m].
+
+    Returns:
+        Number of the track of each pose, 1 or 2 by their first poses, shape (n,).
+    """
+    known = np.flatnonzero(np.isfinite(position[:, :2]).all(axis=1))
+    places = position[known, 0] + 1j * position[known, 1]
+    steps = np.abs(np.diff(places, prepend=places[:1]))
+    nearest = np.full(places.size, np.inf)
+    for back in range(2, min(_BACK, places.size - 1) + 1):
+        nearest[back:] = np.minimum(nearest[back:], np.abs(places[back:] - places[:-back]))
+    is_far = steps > smallest_m
+    returns = is_far & (nearest < _RETURNS[0] * steps)
+    far = np.flatnonzero(is_far)
+    if returns.sum() < max(FEWEST_MESSAGES, _ALTERNATES * steps.size, _RETURNS[1] * far.size):
+        return None
+    # The second track begins where the poses went that came back first.
+    begins = int(far[np.searchsorted(far, np.flatnonzero(returns)[0]) - 1])
+    number, is_unclear = _follow_tracks(times[known].tolist(), places.tolist(), begins, smallest_m)
+    if np.mean(is_unclear) > _MOST_UNCLEAR or np.mean(np.diff(number) != 0) < _ALTERNATES:
+        return None
+    numbers = np.ones(position.shape[0], dtype=np.int64)
+    numbers[known] = number
+    return numbers
+
+
+def _follow_tracks(
+    times: Sequence[float], places: Sequence[complex], begins: int, smallest_m: float
+) -> tuple[Ints, Flags]:
+    """Number of the track that each pose goes on, by its velocity, and whether it is unclear."""
+    number, is_unclear = np.ones(len(places), dtype=np.int64), np.zeros(len(places), dtype=bool)
+    last = [begins - 1, begins]
+    pace = [0j, 0j]
+    for row in range(begins, len(places)):
+        away = [
+            abs(places[row] - places[one] - rate * (times[row] - times[one]))
+            for one, rate in zip(last, pace, strict=True)
+        ]
+        own = int(away[1] < away[0])
+        is_apart = abs(places[last[0]] - places[last[1]]) > smallest_m
+        is_unclear[row] = is_apart and away[own] > _NEARER * away[1 - own]
+        elapsed = times[row] - times[last[own]]
+        if elapsed > _GOES_ON_S[0]:
+            is_near = elapsed < _GOES_ON_S[1]
+            pace[own] = (places[row] - places[last[own]]) / elapsed if is_near else 0j
+        last[own], number[row] = row, own + 1
+    return number, is_unclear
+
+
+def choose_track(tracks: Ints | None, source: PoseSource) -> Ints:
+    """Rows of the poses of one track.
+
+    Raises:
+        StageError: ``no_track``, the poses are those of one body.
+    """
+    if tracks is None:
+        what = f"run.toml names a track, and the poses of {source} do not alternate between two of them"
+        raise StageError("no_track", what, where=source.topic, hint="Leave out `track` of [pose].")
+    return np.flatnonzero(tracks == source.track)
+
+
 _APART = 3
 """Greatest number of poses in a row that lie apart: more are a map that was corrected for a while."""
 _REPEATED = 0.05

@@ -1,6 +1,7 @@
-"""Two publishers that send commands on one topic by turns, as a joystick beside a planner does.
+"""Two publishers that send on one topic by turns: commands, as of a joystick beside a planner, or poses.
 
-Which of them a drive obeys depends on when it reads, so that nothing is concluded from what they ask for.
+Which command a drive obeys depends on when it reads, so that nothing is concluded from what they ask for.
+Poses of two robots, or of two estimators of one, jump to and fro between two tracks, one of which is taken.
 """
 
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 from pipeline.core import Floats
 from pipeline.recording.case import NO_CANDIDATE, Case
 from pipeline.recording.findings import Finding
+from pipeline.recording.motion import measure_motion
 from pipeline.recording.outages import write_spans
 from pipeline.recording.readings import Reading
 from pipeline.run import LIVE_SHARE
@@ -30,8 +32,42 @@ _JOINED_S = 10.0
 """Pause of the commands [s] in which the turns of two publishers do not show, and go on."""
 _UNEVEN = 0.3
 """Least range of the intervals between messages [medians]: those of one publisher that switches are even."""
+_UNLIKE = 0.5
+"""Explained shares of one track's motion over those of the other, up to which it is another body's."""
 _MOST = 0.5
 """Share of the driving from which on the turns are no exception, and the command is of no use."""
+
+
+def ask_tracks(case: Case) -> Case:
+    """Of poses that alternate between two tracks, those of the one that what drives the vehicle explains."""
+    pose = case.sources.pose
+    tracks = None if pose is None or pose.track else case.extraction.find_tracks()
+    if pose is None or tracks is None:
+        return case
+    drives = {"command": case.sources.command, "wheels": case.sources.wheels}
+    readings = [case.read(one, is_measured=role == "wheels") for role, one in drives.items() if one]
+    each = [case.extraction.take_pose(replace(pose, track=number)) for number in (1, 2)]
+    shares = []
+    for extraction in each:
+        motion = measure_motion(extraction.poses())
+        made = [(one.name, one.fitted(motion).explained) for one in readings]
+        shares.append(max(((sum(of.shares), name) for name, of in made if of.is_sure), default=(0.0, "")))
+    (less, _), (most, by) = sorted(shares)
+    why = "both" if less > _UNLIKE * most else "told" if most else "neither"
+    number = 1 + shares.index(max(shares))
+    values = {
+        "kind": why,
+        "frames": [*case.extraction.frames] if all(case.extraction.frames) else [],
+        "source": str(pose),
+        "by": by,
+        "number": number,
+    }
+    if why == "told":
+        case.findings.append(Finding("track_taken", "warning", "pose", values))
+    else:
+        case.findings.append(Finding("tracks_mixed", "error", "pose", values))
+    sources = replace(case.sources, pose=replace(pose, track=number))
+    return replace(case, extraction=each[number - 1], sources=sources)
 
 
 def ask_publishers(case: Case) -> Case:

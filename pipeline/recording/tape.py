@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core import SlipError
+from pipeline.core import Floats, SlipError, arrays
 from pipeline.logs import LogIndex, read_topics
 from pipeline.recording.case import Case
 from pipeline.recording.extract import Extraction, Given
@@ -22,6 +22,8 @@ _FAR = 2.0
 """Ratio to the vehicle's own length beyond which the tape measured something else: no wheel wears so far."""
 _TURNS = 0.1
 """Error of counted turns: a tenth of one, as a mark on the ground shows."""
+_LEAST_SWING = 0.02
+"""Turning back over the range of the heading, below which it is no leg of its own: the noise of a drive."""
 
 
 def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Finding]:
@@ -48,12 +50,12 @@ def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Findi
     given = Given(log, alone, configuration, vehicle, where=str(index.path))
     case = Case(given, Extraction(given), alone, None)
     reading = case.read(source, is_measured=is_measured)
-    first, second = (abs(sum(parts)) for parts in _split(reading.first, reading.second, reading.form))
+    first, second = _add_up(reading.first, reading.second, reading.form)
     turns, turns_error = truth.turns, _TURNS
     gyro = case.read_gyro().second
     if turns is None and gyro.moves:
         # A gyro counts turns as well as the eye.
-        turns = abs(_integrate(gyro)) / (2.0 * np.pi)
+        turns = _count_both_ways(_accumulate(gyro)[1]) / (2.0 * np.pi)
         turns_error = 0.01 * turns
     angle = 2.0 * np.pi * (turns or 0.0)
     values: dict[str, object] = {"source": str(source), "kind": reading.form}
@@ -99,15 +101,36 @@ def add_lengths(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:
     return type(error)(error.code, error.what, where=error.where, hint=f"{error.hint}{hint}")
 
 
-def _split(left: Held, right: Held, form: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """What adds up to the way ahead, and to the turning, in the signals' own units."""
-    one, other = _integrate(left), _integrate(right)
-    return ((0.5 * one, 0.5 * other), (other, -one)) if form == "sides" else ((one,), (other,))
+def _add_up(left: Held, right: Held, form: str) -> tuple[float, float]:
+    """The way ahead from start to end, and all turning to either side, in the signals' own units."""
+    times, one = _accumulate(left)
+    later, other = _accumulate(right)
+    if form == "sides":
+        other = np.interp(times, later, other) if later.size else np.zeros_like(one)
+        one, other = 0.5 * (one + other), other - one
+    return abs(float(one[-1])) if one.size else 0.0, _count_both_ways(other)
 
 
-def _integrate(signal: Held) -> float:
+def _accumulate(signal: Held) -> tuple[Floats, Floats]:
+    """Times [s] of the known values, and their integral up to each."""
     known = np.isfinite(signal.values)
-    return float(np.trapezoid(signal.values[known], signal.times[known]))
+    times = signal.times[known]
+    return times, arrays.integrate_rate(times, signal.values[known])
+
+
+def _count_both_ways(heading: Floats) -> float:
+    """Sum of the ways between the turning points of a heading: legs to the left and to the right add up."""
+    if not heading.size:
+        return 0.0
+    least, total = _LEAST_SWING * float(np.ptp(heading)), 0.0
+    begin = far = float(heading[0])
+    for value in heading.tolist():
+        sense = 1.0 if far >= begin else -1.0
+        if sense * (value - far) > 0.0:
+            far = value
+        elif sense * (far - value) > least:
+            total, begin, far = total + abs(far - begin), far, value
+    return total + abs(far - begin)
 
 
 def _share(distance_m: float) -> float:

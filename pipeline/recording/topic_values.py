@@ -133,6 +133,8 @@ _SIDEWAYS_SHARE = 0.01
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRAME = "header.frame_id"
 _POLE_DEG = 90.0  # latitude of a pole
+_COUNTED = (1e-7, 1e-3)
+"""What integers of receivers count: degrees and metres."""
 _FLU_IN_FRD = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -286,7 +288,9 @@ def list_wanted(
         )
         for topic, fields in by_topic.items()
     ]
-    return wanted + _list_wanted_transforms(every, types)
+    return wanted + [
+        one for one in _list_wanted_transforms(every, types) if not one.topic.startswith(sources.other_robots)
+    ]
 
 
 def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
@@ -547,8 +551,10 @@ def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
     fix = find_type(columns.type_name).fix
     if fix is None:
         raise _holds_no("fix", columns, "pose")
-    latitude, longitude = (fix.degrees * numbers(columns, name) for name in (fix.latitude, fix.longitude))
-    altitude = fix.metres * numbers(columns, fix.altitude)
+    is_counted = np.issubdtype(getattr(columns.fields[fix.latitude], "dtype", float), np.integer)
+    degree, metre = _COUNTED if is_counted else (1.0, 1.0)
+    latitude, longitude = (degree * numbers(columns, name) for name in (fix.latitude, fix.longitude))
+    altitude = metre * numbers(columns, fix.altitude)
     status = numbers(columns, fix.status) if fix.status else np.full(latitude.size, fix.least)
     # A receiver without a fix may report zero and zero, in the Gulf of Guinea.
     there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)

@@ -109,6 +109,7 @@ class PoseSource:
         name: of the body, if a message contains the poses of several.
         fields: the fields of the pose, if the configuration names them.
         wheels: the measured wheels whose motion stands in for a pose; None of a recorded pose.
+        track: which of the two tracks between which its poses alternate, 1 or 2; zero takes all poses.
     """
 
     topic: str
@@ -121,6 +122,7 @@ class PoseSource:
     name: str = ""
     fields: PoseFields | None = None
     wheels: DriveSource | None = None
+    track: int = 0
 
     def __str__(self) -> str:
         if self.wheels is not None:
@@ -147,6 +149,7 @@ class Sources:
         command, wheels, pose, imu, interval: source of each role.
         notes: remarks on the choice.
         others: by role, the alternatives, the best first.
+        other_robots: namespaces of the robots that are not analyzed.
     """
 
     command: DriveSource | None
@@ -156,6 +159,7 @@ class Sources:
     interval: TopicSource | None
     notes: tuple[str, ...] = ()
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
+    other_robots: tuple[str, ...] = ()
 
     @property
     def topics(self) -> set[str]:

@@ -134,11 +134,11 @@ class TruthSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     Attributes:
         distance_m: distance between start and end of a straight drive by a tape, to 5 mm or 0.5 %.
-        turns: whole and part turns on the spot as counted, to a tenth.
+        turns: whole and part turns on the spot as counted, to a tenth; those to either side add up.
     """
 
     distance_m: Annotated[float, msgspec.Meta(ge=1e-3, le=1e5)] | None = None
-    turns: Annotated[float, msgspec.Meta(ge=1e-3, le=1e4)] | None = None
+    turns: Annotated[float, msgspec.Meta(ge=0.25, le=1e4)] | None = None
 
 
 class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -233,6 +233,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             capture, ``-y`` of a camera's optical frame.
         heading_deg: angle from the recorded heading to the vehicle's own [degrees], counterclockwise.
         unit: of the positions; by default metres.
+        track: which of the tracks of two publishers on one topic, by their first poses.
         time: which of the message's times to use.
     """
 
@@ -247,6 +248,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
     heading_deg: Annotated[float, msgspec.Meta(ge=-360.0, le=360.0)] | None = None
     unit: Literal["m", "cm", "mm"] | None = None
+    track: Literal[1, 2] | None = None
     time: Clock | None = None
 
 

@@ -194,11 +194,12 @@ def choose_sources(
     sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
         wheels=chooser.choose_drive(configuration.wheels, commanded=False),
-        pose=chooser.choose_pose(configuration.pose),
+        pose=chooser.choose_track(configuration.pose),
         imu=chooser.choose_imu(configuration.imu.topic),
         interval=chooser.choose_interval(configuration),
         notes=tuple(chooser.notes),
         others=chooser.others,
+        other_robots=chooser.other_robots,
     )
     return sources.separated()
 
@@ -213,6 +214,7 @@ class _Chooser:
         self.where = where
         self.notes: list[str] = []
         self.others: dict[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = {}
+        self.other_robots: tuple[str, ...] = ()
         self._robot: str | None = None
         self._steered = vehicle.kinematics.has_inputs("speed", "steering")
 
@@ -234,7 +236,8 @@ class _Chooser:
         named = list_named(configuration)
         self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
         if self._robot is not None:
-            others = ", ".join(robot.strip("/") for robot in robots if robot != self._robot)
+            self.other_robots = tuple(robot for robot in robots if robot != self._robot)
+            others = ", ".join(robot.strip("/") for robot in self.other_robots)
             self.notes.append(f"robot: {self._robot.strip('/')}; the log holds topics of {others} as well")
 
     def of_type(self, *types: str) -> list[str]:
@@ -352,6 +355,11 @@ class _Chooser:
             rank, reason = RANKS["transforms"]
             candidates.append((rank, PoseSource(transforms, reason, from_transforms=True)))
         return self._best(candidates, self.vehicle.topics.pose, "pose")
+
+    def choose_track(self, section: PoseSection) -> PoseSource | None:
+        """The localization, with the track that is configured."""
+        pose = self.choose_pose(section)
+        return pose and replace(pose, track=section.track or 0)
 
     def _pose_of_fields(self, section: PoseSection) -> PoseSource:
         """The pose of three fields of a topic."""

@@ -370,7 +370,7 @@ def _fit(
         return None
     top = float(np.quantile(size[size > STILL_MPS], 0.95))
     moves = size + np.abs(target).sum(axis=1) > 2.0 * _SAME * top
-    rows = is_judged & (np.convolve(moves, np.ones(3), "same") > 0.0)
+    rows = is_judged & (np.convolve(moves, np.ones(3))[1:-1] > 0.0)
     if rows.sum() < _FEWEST_BLOCKS:
         return None
     values, least = target[rows], _SAME * top

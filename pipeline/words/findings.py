@@ -996,6 +996,28 @@ def _mixed(of: Values, done: str) -> str:
     )
 
 
+def _tracks(of: Values, rest: str) -> str:
+    """Poses that alternate between two tracks, and what follows."""
+    frames = f" of {' -> '.join(of['frames'])}" if of["frames"] else ""
+    return (
+        f"two publishers{frames} send on {of['source']} by turns: its poses jump to and fro between two "
+        f"tracks, {rest}"
+    )
+
+
+_ONE_TRACK = "let one publish, or give each its own frames"
+_NO_TRACK = f"{_ONE_TRACK}; [pose] track = 1 or 2 in run.toml takes those of one"
+
+
+def _track_taken(of: Values) -> str:
+    which = ("first", "second")[of["number"] - 1]
+    return _tracks(
+        of,
+        f"and those of the {which} one are taken, which follow {of['by']} ([pose] track = {of['number']} in "
+        f"run.toml; track = {3 - of['number']} takes the others); {_ONE_TRACK}",
+    )
+
+
 def _mixed_left_out(of: Values) -> str:
     return _mixed(of, f": left out, as {of['line']} under [command] in run.toml does; ignore = [] takes them")
 
@@ -1195,6 +1217,11 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "unit_undecided": _unit_undecided,
     "command_mixed": {"left out": _mixed_left_out, "replaced": _mixed_replaced},
     "commands_mixed": partial(_mixed, done=""),
+    "track_taken": _track_taken,
+    "tracks_mixed": {
+        "both": partial(_tracks, rest=f"both of which follow what drives the vehicle: {_NO_TRACK}"),
+        "neither": partial(_tracks, rest=f"neither of which follows what drives the vehicle: {_NO_TRACK}"),
+    },
     "motor_reversed": _motor_reversed,
     "wheel_dead": _wheel_dead,
     "encoder_dead": _encoder_dead,

@@ -18,7 +18,9 @@ from drawn_drives import (
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
-def record_transforms(drive: DrawnDrive, robots: Mapping[str, tuple[str, float]]) -> DrawnTopic:
+def record_transforms(
+    drive: DrawnDrive, robots: Mapping[str, tuple[str, float]], topic: str = "/tf"
+) -> DrawnTopic:
     """Bodies by frame: their parent, and the share of the drive's motion that they make."""
     count, frames = drive.time.size, len(robots)
     whole, rest = (np.repeat(one[:, None], frames, axis=1) for one in np.divmod(drive.stamps, 10**9))
@@ -33,7 +35,7 @@ def record_transforms(drive: DrawnDrive, robots: Mapping[str, tuple[str, float]]
         "transforms[].transform.rotation.z": np.sin(np.outer(drive.yaw, shares) / 2.0),
         "transforms[].transform.rotation.w": np.cos(np.outer(drive.yaw, shares) / 2.0),
     }
-    return record_cdr(drive, "/tf", TRANSFORMS, fields)
+    return record_cdr(drive, topic, TRANSFORMS, fields)
 
 
 @pytest.mark.parametrize(
@@ -72,3 +74,13 @@ def test_an_arm_on_the_robot_is_no_other_robot(tmp_path: Path) -> None:
     log = write_drawn(tmp_path / "run.mcap", record_twist(drive), record_transforms(drive, robots))
     np.testing.assert_allclose(extract_drawn(log)["x"], drive.x, atol=1e-9)
     assert "several_robots" not in [one["id"] for one in extract_drawn(log, "findings").to_dicts()]
+
+
+def test_equal_frames_in_namespaces_are_those_of_each_robot(tmp_path: Path) -> None:
+    drive = draw_drive()
+    shares = {"/robot1/tf": 0.4, "/robot2/tf": 1.0}
+    transforms = [
+        record_transforms(drive, {"base_link": ("map", share)}, topic) for topic, share in shares.items()
+    ]
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive, "/robot2/cmd_vel"), *transforms)
+    np.testing.assert_allclose(extract_drawn(log)["x"], drive.x, atol=1e-9)

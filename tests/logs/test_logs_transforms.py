@@ -95,6 +95,22 @@ def test_a_correction_that_long_stood_is_a_jump_where_it_changes(tmp_path: Path)
     assert np.allclose(series.position, (forward + moved)[(series.time - START) // STEP], atol=1e-9)
 
 
+def test_stamps_that_many_poses_share_are_no_times_of_them(tmp_path: Path) -> None:
+    times, path = START + np.arange(200) * STEP, tmp_path / "log.mcap"
+    forward = np.outer(np.arange(200), [0.1, 0.0, 0.0])
+    with LogWriter(path) as writer:
+        columns = transforms("odom", "base_link", forward, np.zeros(200))
+        writer.write_columns("/tf", KIND, times, columns, header_time=times // 10**9 * 10**9)
+        # One that is sent again and again, as it was, keeps its stamp.
+        held = transforms("map", "odom", 0.0 * forward, np.zeros(200))
+        writer.write_columns("/tf", KIND, times, held, header_time=np.full(200, START))
+    series = buffer_of(path).lookup_series("map", "base_link")
+    assert series.time.tolist() == times.tolist()
+    assert np.allclose(series.position, forward, atol=1e-9)
+    (note,) = series.notes
+    assert note == "stamps of base_link are those of several poses: log times were used"
+
+
 def test_a_future_dated_correction_serves_from_the_start(tmp_path: Path) -> None:
     times = START + np.arange(100) * STEP
     path = tmp_path / "log.mcap"

@@ -360,6 +360,36 @@ def test_a_tape_and_turns_tell_radius_and_track(
         set_up_log(log, Options(out=tmp_path))
 
 
+@pytest.mark.parametrize("legs", [(10.0,), (-10.0,), (0.5,), (5.0, -5.0), (-20.0, 10.0, -0.5)])
+@pytest.mark.parametrize("counted", [True, False], ids=["counted", "gyro"])
+def test_turns_to_either_side_add_up(
+    legs: tuple[float, ...],
+    counted: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    radius, track = 0.033, 0.16
+    still = np.zeros(round(2.0 / STEP))
+    ahead = np.full(round(10.0 / STEP), 2.0 / radius / 10.0)
+    spins = [
+        np.full(round(4.0 * abs(leg) / STEP), np.sign(leg) * np.pi * track / radius / 4.0) for leg in legs
+    ]
+    noise = np.random.default_rng(7).normal(scale=0.01, size=(2, 10**5))
+    left, right = (
+        np.concatenate([still, ahead, *(part for spin in spins for part in (still, side * spin)), still])
+        for side in (-1.0, 1.0)
+    )
+    left, right = left + noise[0, : left.size], right + noise[1, : right.size]
+    log = drive_by_hand(
+        tmp_path / "log.mcap", left, right, None if counted else radius * (right - left) / track
+    )
+    turns = f"turns = {sum(abs(leg) for leg in legs)}" if counted else ""
+    (tmp_path / "run.toml").write_text(f"[truth]\ndistance_m = 2.0\n{turns}\n")
+    (found,) = [one for one in inspect_log(log, Options(out=tmp_path)).notes if one.id == "lengths_by_tape"]
+    value, low, high = found.values["track_width_m"]
+    assert value == pytest.approx(track, rel=0.02)
+    assert 0.0 < low < track < high
+
+
 def test_a_tape_that_contradicts_the_vehicle_offers_no_length(samples: Path, tmp_path: Path) -> None:
     options = Options(out=tmp_path, overrides={"truth": {"distance_m": 0.2, "turns": 3.0}})
     notes = inspect_log(samples / "husky_tile.mcap", options).notes

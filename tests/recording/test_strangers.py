@@ -330,6 +330,7 @@ def test_fixes_once_a_second_are_said_to_be_too_slow(tmp_path: Path) -> None:
     ("kind", "names", "per_degree", "number"),
     [
         ("SensorGps", ("latitude_deg", "longitude_deg", "altitude_msl_m"), 1.0, "float64"),
+        ("SensorGps", ("lat", "lon", "alt"), 1e7, "int32"),
         ("VehicleGpsPosition", ("lat", "lon", "alt"), 1e7, "int32"),
     ],
 )

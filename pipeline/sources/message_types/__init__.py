@@ -114,8 +114,8 @@ class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A position on Earth; a status below the least one is no fix, without a status each is one.
 
     Attributes:
-        latitude, longitude: times `degrees`, in degrees.
-        altitude: times `metres`, in metres.
+        latitude, longitude: in degrees; integers count 1e-7 degrees.
+        altitude: in metres; in millimetres where latitudes are integers.
         status: what kind of fix it is.
         least: status of a fix.
         frame: field with the name of the antenna's frame; empty if there is none.
@@ -127,8 +127,6 @@ class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     status: str = ""
     least: int = 0
     frame: str = "header.frame_id"
-    degrees: float = 1.0
-    metres: float = 1.0
 
 
 class GroundVelocityFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -230,6 +228,7 @@ _PATHS = {
     "joints": ("names", "velocity", "position"),
     "pose": ("position", "orientation", "angle", "parent", "child"),
     "imu": ("rate", "force", "orientation"),
+    "fix": ("latitude", "longitude", "altitude", "status", "frame"),
 }
 """Fields of a part that are paths; its other values state what these mean."""
 _OPTIONAL = re.compile(r"pose .*(?:parent|child)$")
