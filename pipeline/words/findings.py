@@ -1078,8 +1078,9 @@ def _pose_angle(of: Values) -> str:
     side = "left" if of["value"] > 0.0 else "right"
     return (
         f"the body moves {abs(math.degrees(of['value'])):.1f} degrees (±{of['half_deg']:.2g}) to the {side} "
-        f"of the headings of {of['pose']}: their frame is turned, or the body crabs or drifts, as on a bent axle or "
-        f"along a slope; no other signal tells which (heading_deg = {of['heading_deg']:.1f} under [pose] in "
+        f"of the headings of {of['pose']}: their frame is turned, or the body crabs or drifts, as on a bent "
+        "axle or along a slope; no other signal tells which "
+        f"(heading_deg = {of['heading_deg']:.1f} under [pose] in "
         "run.toml turns it)"
     )
 
