@@ -39,7 +39,6 @@ GROUPS = {
     "literature": "the best model of the literature",
     "learned": "the best learned model",
     "named + trees": "named + trees",
-    "named + learned": "named + learned",
 }
 Data = Mapping[str, Any]
 

@@ -45,6 +45,9 @@ SAMPLES = ROOT / "data_samples"
 ERRORS = ("t_mrmse_m", "r_mrmse_rad")
 # Estimates have six digits: those of two fits of the same model differ by one of the last at most.
 SAME = 1e-5
+# A recording drives motors over dents of the likelihood: another fit of its model ends within a tenth of half
+# an interval, and its errors agree to three digits.
+NEAR, THREE_DIGITS = 0.1, 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +70,9 @@ def same(one: object, other: object, tolerance: float = SAME) -> bool:
     return one == other
 
 
-def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) -> None:
+def compare_everywhere(
+    log: Path, source: Input, results: Path, tmp_path: Path, *, is_recorded: bool = False
+) -> None:
     manifest = analyze(log, results)
     before = hash_results(results)
     vehicle, recording = read_recording(manifest)
@@ -82,12 +87,11 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     file = read_model(path)
     check_written(told, file, describe(diagnosis.runs, everything=True))
     check_page(told, describe(diagnosis.runs), describe(diagnosis.runs, everything=True))
-    own = check_model_verbs(
-        told, file, EstimationData([load_recording(recording, vehicle)], file.model.vehicle, source)
-    )
+    data = EstimationData([load_recording(recording, vehicle)], file.model.vehicle, source)
+    own = check_model_verbs(told, file, data, is_recorded=is_recorded)
     require_no_rise(told["ladder"])
     if file.model.effects:
-        check_workbench(told, file, own, manifest)
+        check_workbench(told, file, own, manifest, is_recorded=is_recorded)
         view = view_diagnosis(recording.tables, vehicle, diagnosis.runs[0])
         assert view is not None
         assert set(view.effects) == set(file.model.ids)
@@ -141,37 +145,46 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
         assert re.search(rf"{name} = {shown}(?![\d.])", screen), (effect, name)
 
 
-def check_model_verbs(told: Json, file: ModelFile, data: EstimationData) -> Json:
+def check_model_verbs(told: Json, file: ModelFile, data: EstimationData, *, is_recorded: bool) -> Json:
     """What the model verbs find on the run is what was written; returns the errors of the whole model."""
     judged = assess_model(data, file.model)
     for effect, name, number in list_numbers(told):
         entry: Json = list_values(judged.fitted.model.effect(effect), judged.estimates)[name].to_json()
         assert number["at_bound"] == entry["at_bound"]
         for end in ("value", "low", "high"):
-            assert same(number[end], entry[end]), (effect, name, end)
+            assert same(number[end], entry[end], find_tolerance(number, is_recorded)), (effect, name, end)
     floor = to_json(judged.floor)
     ladder = [to_json(step) for step in judged.ladder.as_result(judged.floor)]
     (carried,) = carry_over(file.model, list(data.runs), data.source)
     ideal, own = to_json(carried.ideal.pooled), to_json(carried.own.pooled)
+    digits = THREE_DIGITS if is_recorded else SAME
     for key in ERRORS:
         assert same(told["ladder"][0][key], ladder[0][key])
         assert same(told["ladder"][0][key], ideal[key])
-        assert same(told["ladder"][-1][key], ladder[-1][key])
-        assert same(told["ladder"][-1][key], own[key])
-        assert same(told["noise_floor"][key], floor[key])
+        assert same(told["ladder"][-1][key], ladder[-1][key], digits)
+        assert same(told["ladder"][-1][key], own[key], digits)
+        assert same(told["noise_floor"][key], floor[key], digits)
     return own
 
 
-def check_workbench(told: Json, file: ModelFile, own: Json, manifest: Manifest) -> None:
+def find_tolerance(number: Json, is_recorded: bool) -> float:  # noqa: FBT001 - a fact about the log
+    """By how much of its value an end of a number, or the number, may differ in another fit."""
+    if not is_recorded or None in (number["low"], number["high"]) or number["value"] == 0.0:
+        return SAME
+    return max(SAME, abs(NEAR * 0.5 * (number["high"] - number["low"]) / number["value"]))
+
+
+def check_workbench(told: Json, file: ModelFile, own: Json, manifest: Manifest, *, is_recorded: bool) -> None:
     """*Add all* enters the fit of the diagnosis."""
     session = open_session(prepare_run(manifest, str(told["input"])), None)
     assert all(same(getattr(session.step.ladder[0], key), told["ladder"][0][key]) for key in ERRORS)
     session = session.add(file.model.effects, anyway=True)
-    assert all(same(getattr(session.step.ladder[-1], key), own[key]) for key in ERRORS)
+    digits = THREE_DIGITS if is_recorded else SAME
+    assert all(same(getattr(session.step.ladder[-1], key), own[key], digits) for key in ERRORS)
     kept = session.step.model
-    for effect in file.model:
-        for name, value in effect.values.items():
-            assert same(kept.effect(effect.id).values[name], value) or math.isnan(value)
+    for effect, name, number in list_numbers(told):
+        there = kept.effect(effect).values[name]
+        assert same(there, number["value"], find_tolerance(number, is_recorded)), (effect, name)
 
 
 def require_no_rise(ladder: list[Json]) -> None:
@@ -216,4 +229,4 @@ def test_every_verb_file_and_page_says_the_same_of_a_recording(
         pytest.skip("../shared/logs is not here: the real recordings are not part of the repository")
     if "plank" in name and source is Input.MEASURED:
         pytest.skip("the measured wheels of this recording are zero throughout")
-    compare_everywhere(log, source, results, tmp_path)
+    compare_everywhere(log, source, results, tmp_path, is_recorded=True)
