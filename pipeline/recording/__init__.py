@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.recording.clocks import *
     from pipeline.recording.drive import *
     from pipeline.recording.echo import *
+    from pipeline.recording.evidence import *
     from pipeline.recording.examination import *
     from pipeline.recording.extract import *
     from pipeline.recording.findings import *
@@ -37,6 +38,7 @@ else:
             "clocks": ("find_pauses",),
             "drive": ("SIGNALS", "interpolate_readings"),
             "echo": ("check_echo",),
+            "evidence": ("RADII_M",),
             "examination": ("Recording", "examine"),
             "extract": ("Extracted", "Extraction", "Given", "extract_tables"),
             "findings": ("SURE", "Finding", "Severity", "StageError", "blame_damage"),
@@ -75,6 +77,7 @@ class LogOptions:
 
 
 FAULTS = (
+    "configured_wrongly",
     "signs_contradict",
     "command_reversed",
     "command_of_map",

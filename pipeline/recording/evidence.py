@@ -401,7 +401,7 @@ _UNUSUAL = 4.0
 """Surprise of counts that no unit explains, as ticks of an encoder are [nats]."""
 _ANY = 10.0
 """Range of the logarithm of what such a count may be."""
-_RADII_M = (0.02, 1.0)
+RADII_M = (0.02, 1.0)
 """Radii [m] that wheels of vehicles have."""
 _WIDEST = 0.5
 """Radius of a wheel over the track, below which it is: wheels of both sides do not meet."""
@@ -419,7 +419,7 @@ def can_roll(gain: float, share: float, turn: float | None = None) -> bool:
             None if nothing tells.
     """
     size = abs(gain)
-    is_round = _shrink(float(np.log(size / _RADII_M[0])), share) >= 0.0 and size <= _RADII_M[1]
+    is_round = _shrink(float(np.log(size / RADII_M[0])), share) >= 0.0 and size <= RADII_M[1]
     return is_round and (turn is None or abs(turn) < _WIDEST)
 
 

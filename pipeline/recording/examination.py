@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import msgspec
+
 from pipeline.core import SlipError
 from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_as_wheels
-from pipeline.recording.evidence import equal_motion
+from pipeline.recording.evidence import RADII_M, equal_motion
 from pipeline.recording.extract import Given
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import Geometry, explain_wheels
@@ -149,12 +151,59 @@ QUESTIONS: tuple[Callable[[Case], Case], ...] = (
 """Questions on a log in their order: each is asked with what those before it decided."""
 
 
+_READ_AS = (
+    "unit", "yaw_unit", "steering_unit", "per_turn", "sign", "reversed", "exchanged", "scale", "factors",
+)  # fmt: skip
+"""Keys of run.toml that say how the numbers of a signal are read."""
+_ALIKE = 1.3
+"""Ratio of a length or a scale to the one that is known, up to which they are alike."""
+
+
 def examine(given: Given) -> Recording:
     """Decide which reading of a log's signals makes its body move as it does.
+
+    Where something contradicts the log as run.toml reads it, it is examined without each section's keys for
+    units, signs and scales, too. A section without which nothing is contradicted that was not before is
+    wrong, and no radius, gain or wiring is blamed for it.
 
     Returns:
         What is in the log; without a pose in it where nothing can stand in for one.
     """
+    recording = _examine(given)
+    doubts = _list_doubts(recording, given)
+    for role in ("command", "wheels", "pose", "imu") if doubts else ():
+        section = getattr(given.configuration, role)
+        usual = type(section)()
+        keys = [key for key in _READ_AS if getattr(section, key, None) != getattr(usual, key, None)]
+        if not keys:
+            continue
+        plain = msgspec.structs.replace(section, **{key: getattr(usual, key) for key in keys})
+        without = msgspec.structs.replace(given.configuration, **{role: plain})
+        if _list_doubts(_examine(replace(given, configuration=without)), given) < doubts:
+            given_as = {key: getattr(section, key) for key in keys}
+            wrong = Finding("configured_wrongly", "error", role, {"given": given_as})
+            return replace(recording, findings=(wrong,))
+    return recording
+
+
+def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
+    """What contradicts a reading of a log: findings, and scales that no such vehicle has."""
+    found = {(one.id, one.where) for one in recording.findings if one.severity != "info"}
+    if recording.refused is not None:
+        found.add((recording.refused.id, recording.refused.where))
+    radius = given.vehicle.wheel_radius_m
+    radii = (radius / _ALIKE, radius * _ALIKE) if given.is_known else RADII_M
+    ranges = {"gyro": [(1.0 / _ALIKE, _ALIKE)]}
+    for one in recording.evidence:
+        scale = one.turned if one.role == "gyro" else one.ahead
+        usual = ranges.get(one.role, [(1.0 / _ALIKE, _ALIKE), radii])
+        if scale and not any(low <= scale <= high for low, high in usual):
+            found.add(("scale", one.name))
+    return found
+
+
+def _examine(given: Given) -> Recording:
+    """What is in a log, as its configuration reads it."""
     as_given = Recording(given.sources, given.configuration)
     try:
         case = open_case(given)

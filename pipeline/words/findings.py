@@ -1,5 +1,6 @@
 """Sentences of findings: one template an id, formatted with the values of the finding."""
 
+import json
 import math
 import string
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +17,7 @@ from pipeline.core import (
     name_first,
     suffix_unit,
 )
-from pipeline.recording import Finding
+from pipeline.recording import RADII_M, Finding
 
 Values = Mapping[str, Any]
 """The values of a finding, and ``where`` it is."""
@@ -344,9 +345,14 @@ def _wheel_scale(of: Values) -> str:
 
 def _wheel_radius_wrong(of: Values) -> str:
     gain, radius = of["gain"], of["value"]
-    return (
+    seen = (
         f"the vehicle covers {format_share(gain)} of the distance that wheels with a radius of "
-        f"{of['radius_m']:.3g} m roll: if the radius is {radius:.3g} m, give --wheel-radius {radius:.3g} or "
+        f"{of['radius_m']:.3g} m roll"
+    )
+    if not RADII_M[0] <= radius <= RADII_M[1]:
+        return f"{seen}: a unit is wrong, of the wheels or of the positions, or the positions have no scale"
+    return (
+        f"{seen}: if the radius is {radius:.3g} m, give --wheel-radius {radius:.3g} or "
         f"another --vehicle (in the controller: a wheel radius multiplier of {gain:.2g}); or the positions "
         "have no scale, as those of a single camera"
     )
@@ -962,6 +968,17 @@ def _configured(of: Values) -> str:
     return f"{fault}, but [{of['where']}] in run.toml gives {given}: correct it"
 
 
+def _configured_wrongly(of: Values) -> str:
+    given = [
+        key if isinstance(value, dict) else f"{key} = {json.dumps(value)}"
+        for key, value in of["given"].items()
+    ]
+    return (
+        f"[{of['where']}] in run.toml (or in a fleet.toml above it) gives {enumerate_texts(given)}, which "
+        "contradicts the other signals; without it they agree: take it out"
+    )
+
+
 def _contradicted(of: Values) -> str:
     one, other = of["halves"]
     return (
@@ -1208,6 +1225,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         'speed times their tangent: read so, as speed_topic = "{speed}" and steering_topic = "{turn}" under '
         "[command] in run.toml do",
     },
+    "configured_wrongly": _configured_wrongly,
     "signs_contradict": {
         "configured": _configured,
         "command and wheels": _command_against_wheels,

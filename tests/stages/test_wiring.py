@@ -30,15 +30,19 @@ def exchange(section: str, topic: str) -> str:
         (exchange("wheels", "/joint_states"), "wheels_corrected", "exchanged = true under [wheels]"),
         (
             '[wheels]\ntopic = "/joint_states"\nsign = -1\n',
-            "signs_contradict",
-            "[wheels] in run.toml gives sign",
+            "configured_wrongly",
+            "[wheels] in run.toml (or in a fleet.toml above it) gives sign = -1",
         ),
         (
             exchange("command", "/wheel_commands"),
             "command_reversed",
             "angular.z or of the steering is inverted",
         ),
-        ('[command]\ntopic = "/controller/cmd_vel"\nsign = -1\n', "command_reversed", "the sign of linear.x"),
+        (
+            '[command]\ntopic = "/controller/cmd_vel"\nsign = -1\n',
+            "configured_wrongly",
+            "[command] in run.toml (or in a fleet.toml above it) gives sign = -1",
+        ),
         ("", "", ""),
     ],
 )

@@ -1,0 +1,51 @@
+"""Lines of run.toml that contradict the log: they are named, and no radius, gain or wiring is blamed."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.results import read_findings
+from pipeline.words.findings import format_finding
+
+LOG = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
+
+
+def find_what_is_told(tmp_path: Path, section: str, line: str) -> list[str]:
+    place = tmp_path / "drive"
+    place.mkdir()
+    (place / LOG.name).write_bytes(LOG.read_bytes())
+    (place / "run.toml").write_text(f"[{section}]\n{line}\n", encoding="utf-8")
+    answer = analyze_log(place / LOG.name, Options(out=tmp_path / "results", report=False, diagnosis=False))
+    findings = read_findings(answer.summary)
+    assert [one.id for one in findings if one.severity == "error"] == (
+        ["configured_wrongly"] if "rad/s" not in line else []
+    )
+    return [format_finding(one) for one in findings]
+
+
+@pytest.mark.parametrize(
+    ("section", "line"),
+    [
+        ("command", 'unit = "rpm"'),
+        ("command", "sign = -1"),
+        ("command", "exchanged = true"),
+        ("wheels", 'unit = "rpm"'),
+        ("wheels", 'unit = "m/s"'),
+        ("wheels", "sign = -1"),
+        ("pose", 'unit = "mm"'),
+        ("imu", 'unit = "deg/s"'),
+    ],
+)
+def test_a_line_that_the_log_contradicts_is_named_and_nothing_else(
+    section: str, line: str, tmp_path: Path
+) -> None:
+    told = find_what_is_told(tmp_path, section, line)
+    assert any(f"[{section}] in run.toml" in one and line in one for one in told)
+    assert not any("--wheel-radius" in one or "wired" in one for one in told)
+
+
+@pytest.mark.parametrize("section", ["wheels", "imu"])
+def test_a_line_that_says_what_is_so_anyway_is_no_fault(section: str, tmp_path: Path) -> None:
+    assert not any("contradicts" in one for one in find_what_is_told(tmp_path, section, 'unit = "rad/s"'))
