@@ -578,6 +578,7 @@ def _compare(chosen: Choice, given: Given) -> Choice:
             ratings = (other, *(one for one in ratings if one is not other))
             recording = made
             break
+    _require_agreement(recording, replace(given, sources=sources))
     return replace(
         chosen,
         sources=recording.sources,
@@ -586,6 +587,82 @@ def _compare(chosen: Choice, given: Given) -> Choice:
         log=given.log,
         recording=recording,
     )
+
+
+_READ_AS: Mapping[str, Sequence[str]] = {
+    **dict.fromkeys(
+        ("command", "wheels"),
+        ("unit", "yaw_unit", "steering_unit", "sign", "reversed", "exchanged", "scale"),
+    ),
+    "pose": ("unit",),
+    "imu": ("unit",),
+}
+"""Keys of run.toml that say how the numbers of a role are read, by section."""
+_RADII_M = (0.02, 1.0)
+"""Usual radii of wheels."""
+_TIMES_OFF = 3.0
+"""Motion over signal that no wheels and no ground make, and a wrong unit does: units are nine times apart."""
+
+
+def _require_agreement(recording: Recording, given: Given) -> None:
+    """Refuse a line of run.toml without which a signal agrees with the motion, and with which it does not.
+
+    Raises:
+        ConfigurationError: ``configuration_contradicted``.
+    """
+    from pipeline.recording import examine  # noqa: PLC0415 - heavy
+
+    configuration = given.configuration
+    for name, keys in _READ_AS.items():
+        section = getattr(configuration, name)
+        default = type(section)()
+        lines = [key for key in keys if getattr(section, key) != getattr(default, key)]
+        before = _compare_signals(recording, given, name) if lines else {}
+        for key in lines if any(is_off for _, is_off in before.values()) else ():
+            value = getattr(default, key)
+            bare = msgspec.structs.replace(section, **{key: value})
+            without = msgspec.structs.replace(configuration, **{name: bare})
+            made = examine(replace(given, configuration=without))
+            after = _compare_signals(made, replace(given, configuration=without), name)
+            is_as_recorded = getattr(getattr(made.configuration, name), key) == value
+            if not is_as_recorded or after.keys() != before.keys() or any(off for _, off in after.values()):
+                continue
+            signal, axis = next(one for one, (_, is_off) in before.items() if is_off)
+            verb = "moves" if axis == "ahead" else "turns"
+            line = f"[{name}] {key} = {msgspec.json.encode(getattr(section, key)).decode()}"
+            what = (
+                f"{line} in run.toml contradicts the motion: with it the body {verb} "
+                f"{before[signal, axis][0]:.3g} times as much as {signal} says, without it "
+                f"{after[signal, axis][0]:.3g} times"
+            )
+            hint = f"Remove {key} under [{name}] in run.toml (or in fleet.toml, if it stands there)."
+            raise ConfigurationError("configuration_contradicted", what, where=given.where, hint=hint)
+
+
+def _compare_signals(
+    recording: Recording, given: Given, section: str
+) -> dict[tuple[str, str], tuple[float, bool]]:
+    """Motion over signal by signal and direction, and whether it is off, of what a section reads."""
+    role = {"imu": "gyro", "pose": ""}.get(section, section)
+    known = given.vehicle.wheel_radius_m if given.is_known else None
+    compared = {}
+    for one in recording.evidence:
+        if one.margin is None or not one.role or role not in {"", one.role}:
+            continue
+        source = None if one.role == "gyro" else getattr(recording.sources, one.role)
+        is_wheels = source is not None and source.form in {DriveForm.SIDES, DriveForm.JOINTS}
+        usual, limit = 1.0, _TIMES_OFF
+        if is_wheels:
+            usual = known or math.sqrt(_RADII_M[0] * _RADII_M[1])
+            limit = _TIMES_OFF if known else _RADII_M[1] / usual
+        for axis, gain in (("ahead", one.ahead), ("turned", one.turned)):
+            # Of wheels and of steering, a turn has another scale than a speed: only its sign is compared.
+            has_scale = axis == "ahead" or source is None or source.form is DriveForm.BODY
+            if gain and (axis == "turned" or section != "imu"):
+                ratio = gain / usual
+                is_off = gain < 0.0 or (has_scale and not 1.0 / limit <= ratio <= limit)
+                compared[one.name, axis] = ratio, is_off
+    return compared
 
 
 def _do_without_pose(chosen: Choice, given: Given, refused: Finding) -> Choice:

@@ -342,13 +342,21 @@ def _wheel_scale(of: Values) -> str:
     )
 
 
+_USUAL_RADII_M = (0.02, 1.0)
+
+
 def _wheel_radius_wrong(of: Values) -> str:
     gain, radius = of["gain"], of["value"]
+    # A radius that no usual wheel has is a wrong unit.
+    meant = (
+        f"if the radius is {radius:.3g} m, give --wheel-radius {radius:.3g} or another --vehicle (in the "
+        f"controller: a wheel radius multiplier of {gain:.2g}); "
+        if _USUAL_RADII_M[0] <= radius <= _USUAL_RADII_M[1]
+        else "their speeds, or the positions, are in another unit than is taken (unit in run.toml); "
+    )
     return (
         f"the vehicle covers {format_share(gain)} of the distance that wheels with a radius of "
-        f"{of['radius_m']:.3g} m roll: if the radius is {radius:.3g} m, give --wheel-radius {radius:.3g} or "
-        f"another --vehicle (in the controller: a wheel radius multiplier of {gain:.2g}); or the positions "
-        "have no scale, as those of a single camera"
+        f"{of['radius_m']:.3g} m roll: {meant}or the positions have no scale, as those of a single camera"
     )
 
 
