@@ -592,7 +592,7 @@ def _compare(chosen: Choice, given: Given) -> Choice:
 _READ_AS: Mapping[str, Sequence[str]] = {
     **dict.fromkeys(
         ("command", "wheels"),
-        ("unit", "yaw_unit", "steering_unit", "sign", "reversed", "exchanged", "scale"),
+        ("unit", "yaw_unit", "steering_unit", "sign", "reversed", "exchanged"),
     ),
     "pose": ("unit",),
     "imu": ("unit",),
