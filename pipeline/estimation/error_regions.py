@@ -85,7 +85,9 @@ def map_errors(windows: WindowResiduals, residual: Floats, places: Floats) -> li
             expected = time_share
             if kind in _CIRCUMSTANCES and share > _EXCESS * time_share and not rows.all():
                 inside = _expect_square(response, error, rows)
-                expected = inside / (inside + float(square[~rows].sum()))
+                outside = float(square[~rows].sum())
+                # Without any error outside, nothing there tells what to expect.
+                expected = inside / (inside + outside) if outside > 0.0 else time_share
             rms = float(np.sqrt(square[rows].mean()))
             regions.append(Region(name, kind, which, limits, share, time_share, rms, expected))
     return regions

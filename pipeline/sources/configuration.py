@@ -522,11 +522,12 @@ def explain_range(key: str, value: float, bounds: tuple[float, float]) -> tuple[
     """What is wrong with a number outside its range, with its unit, and a hint."""
     least, largest = bounds
     end = key.rpartition(".")[2].rpartition("_")[2]
-    fits = ((word, value * factor) for word, factor in _SMALLER.get(end, ()))
-    meant = next(((word, number) for word, number in fits if least <= number <= largest), None)
+    fits = [(word, value * factor) for word, factor in _SMALLER.get(end, ())]
+    fits = [(word, number) for word, number in fits if least <= number <= largest]
     unit = end if end in _PLAIN_UNITS else _UNITS.get(end)
     what = f"{key} = {value:g} is outside its range, {least:g} to {largest:g}{suffix_unit(unit)}"
-    return what, f"If it is in {meant[0]}, write {meant[1]:g}." if meant else "Write a value of that range."
+    written = "; ".join(f"if it is in {word}, write {number:g}" for word, number in fits)
+    return what, f"{written[0].upper()}{written[1:]}." if written else "Write a value of that range."
 
 
 def _require_geometry(vehicle: Vehicle, where: str) -> Vehicle:

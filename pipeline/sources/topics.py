@@ -292,6 +292,7 @@ class _Chooser:
 
     def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
         reason = CONFIGURED
+        self._require_whole(section, role)
         if section.left_topic and section.right_topic:
             sides = (section.left_topic, section.right_topic)
             return DriveSource(
@@ -314,6 +315,20 @@ class _Chooser:
                 raise self._bad(what, f"Give {role}.left_topic and {role}.right_topic with field paths.")
             return DriveSource(drives[0].form, drives[0].signals, reason, drives[0].name)
         return None
+
+    def _require_whole(self, section: DriveSection, role: str) -> None:
+        """Refuse one of several keys that are used only together."""
+        turns = ("yaw_rate_topic", "steering_topic")
+        needs = {
+            "left_topic": ("right_topic",), "right_topic": ("left_topic",),
+            "left": ("right",), "right": ("left",),
+            "speed_topic": turns, **dict.fromkeys(turns, ("speed_topic",)),
+        }  # fmt: skip
+        for key, others in needs.items():
+            if getattr(section, key) and not any(getattr(section, other) for other in others):
+                absent = " or ".join(f"{role}.{other}" for other in others)
+                what = f"{role}.{key} is given without {absent}, and is not used alone"
+                raise self._bad(what, f"Give both, or neither, under [{role}] in run.toml.", "field_needed")
 
     def choose_pose(self, section: PoseSection) -> PoseSource | None:
         """The localization: configured, else the best by name, else transforms, else any odometry."""

@@ -16,7 +16,7 @@ from pipeline.datasets.check import Limits, read_limits
 from pipeline.models.model_file import read_model
 from pipeline.plan.plan_files import StoredPlan, read_plan
 from pipeline.sources import VehicleSection, load_configuration
-from pipeline.sources.configuration import Configuration, list_bounds
+from pipeline.sources.configuration import Configuration, explain_range, list_bounds
 
 LOG = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
 SIZES = (0.0, 5e-324, 1e-300, 1e-15, 0.5, 1e3, 1e15, 2.0**63, 1e300, math.inf)
@@ -194,3 +194,8 @@ def test_the_ends_of_a_range_can_be_analyzed(
             *("--config", str(path), "--results", str(tmp_path / "r")),
         )
         assert code in {0, 1, 3}, (number, err)
+
+
+def test_a_length_in_another_unit_is_told_in_each_that_fits() -> None:
+    _, hint = explain_range("wheel_radius_m", 165.0, (1e-3, 2.5))
+    assert hint == "If it is in centimetres, write 1.65; if it is in millimetres, write 0.165."

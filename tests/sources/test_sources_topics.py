@@ -302,6 +302,10 @@ def test_a_calib_state_topic_is_applied_by_default_and_can_be_turned_off() -> No
             "field_needed",
             ["/joint_states", "field"],
         ),
+        ({"command": {"speed_topic": "/joint_states.velocity[0]"}}, "field_needed", ["yaw_rate"]),
+        ({"command": {"yaw_rate_topic": "/joint_states.velocity[0]"}}, "field_needed", ["speed_topic"]),
+        ({"command": {"left_topic": "/nothing.x"}}, "field_needed", ["left_topic", "command.right_topic"]),
+        ({"wheels": {"left": ["front_left"]}}, "field_needed", ["wheels.left", "wheels.right"]),
         ({"pose": {"frames": ["map", "base_link"]}}, "topic_not_found", ["transforms", "pose.topic"]),
         ({"interval": [{"topic": "/joint_states"}]}, "type_not_usable", ["interval", "String"]),
         (
