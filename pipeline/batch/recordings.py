@@ -207,14 +207,15 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         patience_s: time limit of one access to a file or folder [s].
 
     Raises:
-        BatchError: ``logs_not_found``: a target or all of them hold nothing; ``list_unreadable``.
-        LogError: ``log_unreadable``, an object store does not answer.
+        BatchError: ``logs_not_found``: a target or all of them hold nothing, where there are any;
+            ``list_unreadable``.
+        LogError: ``log_unreachable``, an object store does not answer.
     """
     looker = Looker(patience_s)
     listed: set[Path] = set()
     for target in _expand_lists(targets):
         listed |= set(_find_in(target, looker))
-    if not listed and not looker.skipped:
+    if targets and not listed and not looker.skipped:
         raise _refuse(", ".join(targets))
     growing = _find_growing(listed, settle_s, looker)
     silent = {each.path for each in looker.skipped}

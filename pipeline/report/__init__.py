@@ -36,11 +36,23 @@ from pipeline.core import (
     mapping_in,
     name_state,
     naming_os_errors,
+    objects_in,
     shorten,
     suffix_unit,
 )
 from pipeline.recording import Finding
-from pipeline.store import LOG_NOTES, LOG_STATES, Manifest, Store, date_runs
+from pipeline.store import (
+    BATCH_END,
+    LOG_NOTES,
+    LOG_STATES,
+    MANIFEST,
+    RUNS,
+    Manifest,
+    Store,
+    date_runs,
+    encode_run,
+    recorded_path,
+)
 from pipeline.words import NOTHING, Column
 
 if TYPE_CHECKING:
@@ -330,7 +342,8 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     """What became of each log, by path: ``path state reason hint``; without those since removed or moved.
 
     Of several logs of one run the first that is there counts, and the others are copies of it; where none is
-    there any more, the first is gone. One of which nobody can say whether it is there is left out.
+    there any more, the first is gone; without results it does not count. One of which nobody can say whether
+    it is there is left out, as are the paths that the last batch could not look at.
     """
     noted: list[dict[str, str]] = []
     absent: list[tuple[str, str, str, str]] = []
@@ -339,12 +352,14 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     existing = find_existing((path for path in sorted(notes) if "://" not in path), _PATIENCE_S)
     for path, note in sorted(notes.items()):
         texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
-        run, has_run = str(note.get("run") or ""), texts["state"] not in _WITHOUT_RUN
+        # A log that cannot show slip has results or none.
+        run = str(note.get("run") or "")
+        has_run = bool(note.get("key")) and texts["state"] not in _WITHOUT_RUN
         is_there = existing.get(path, True)
         if is_there is not True:
             if is_there:
                 absent.append((path, run if has_run else "", "left_out", is_there))
-            elif has_run:
+            elif has_run and (store.root / RUNS / encode_run(run) / MANIFEST).exists():
                 absent.append((path, run, "gone", _GONE))
             continue
         if has_run and run in holders:
@@ -356,6 +371,13 @@ def list_noted(store: Store) -> list[dict[str, str]]:
         if not run or run not in holders:
             holders.add(run)
             noted.append({"path": path, "state": state, "reason": reason, "hint": ""})
+    folder, name = BATCH_END
+    known = {one["path"] for one in noted}
+    noted += [
+        {"path": str(one["path"]), "state": "left_out", "reason": str(one["reason"]), "hint": ""}
+        for one in objects_in(store.notes(folder).read(name) or {}, "left_out")
+        if one.get("path") not in known
+    ]
     return sorted(noted, key=lambda one: one["path"])
 
 
@@ -474,7 +496,7 @@ def is_page(path: str) -> bool:
 
 def lead_up(run: str, page: str = CATALOGUE) -> str:
     """Address of a page of the results, by default the catalogue, relative to the report of a run."""
-    return "../" * (run.count("/") + 3) + quote(page)
+    return "../" * (len(encode_run(run).parts) + 2) + quote(page)
 
 
 def lead_to(results: Path, folder: Path) -> str:
