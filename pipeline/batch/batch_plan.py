@@ -15,6 +15,7 @@ from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger, Task, see_nothing
+from pipeline.batch.recordings import Recordings
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
@@ -148,11 +149,11 @@ def name_runs(
     return runs, copies
 
 
-def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
+def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
     """Compare the logs with the results.
 
     Args:
-        paths: recordings, absolute, sorted.
+        listed: recordings, absolute, sorted.
         store: the results.
         request: options of the user.
 
@@ -162,9 +163,15 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[li
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
-    ignored = {path: why for path in paths if (why := find_ignored(path, request.options.fleet))}
+    # A pipe or a dead link may be ignored like a log.
+    odd = [each.path for each in listed.skipped if each.is_entry]
+    ignored = {
+        path: why
+        for path in (*listed.recordings, *odd)
+        if (why := find_ignored(listed.name_listed(path), request.options.fleet))
+    }
     settled = [_ignore(path, why, store) for path, why in ignored.items()]
-    paths = [path for path in paths if path not in ignored]
+    paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
     tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
     owners = _find_owners(tasks, manifests)

@@ -175,10 +175,11 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], skipped
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    skipped += listed.skipped
+    planned, settled = make_plan(listed, store, request)
+    ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
+    skipped += (each for each in listed.skipped if str(each.path) not in ignored)
     if request.targets:
         _note_end(store, time.time(), skipped)
-    planned, settled = make_plan(listed.recordings, store, request)
     todo = _select(planned, request.shard)
     if request.targets:
         watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
@@ -206,7 +207,7 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], skipped
     ]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
-    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in listed.skipped]
+    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in skipped]
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,

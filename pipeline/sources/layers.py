@@ -262,7 +262,8 @@ def list_configuration_files(
     A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
     may create one in a folder like `/tmp`.
     """
-    folder = log.resolve().parent
+    # A link to itself may be ignored, too: `Path.resolve` refuses it.
+    folder = Path(os.path.realpath(log)).parent
     fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
     beside = [folder / RUN_FILE, folder / f"{stem_of(log)}.toml"]
     files = [
@@ -408,7 +409,11 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
     Raises:
         ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
-    for path in list_configuration_files(log, fleet=fleet):
+    # As it is listed: a link in the folder of the fleet file may lead out of it.
+    listed = Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
+    above = [folder / FLEET_FILE for folder in reversed(listed.parents)]
+    files = [file for file in above if file.is_file() and _may_speak(file, listed.parent)]
+    for path in dict.fromkeys([*files, *list_configuration_files(log, fleet=fleet)]):
         if path != fleet and path.name != FLEET_FILE:
             continue
         globs = read_toml(path).get("ignore", [])
@@ -417,7 +422,9 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
             raise ConfigurationError(
                 "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
-        names = _names_under(path.resolve().parent, log.resolve())
+        names = _names_under(path.parent.absolute(), listed) + _names_under(
+            path.resolve().parent, Path(os.path.realpath(log))
+        )
         for glob in globs:
             if any(fnmatch.fnmatchcase(name, glob) for name in names):
                 return f'{path}: ignore = "{glob}"'
