@@ -307,13 +307,15 @@ def render_catalogue(store: Store) -> str:
     }
     # Results may be untrusted: texts may have any length.
     verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
+    gathered = _gather_rows(store, manifests) if manifests else []
+    # Columns that no run has a number for would only make the table wide.
+    numbers = [key for key in _NUMBERS if any(isinstance(row[key], int | float) for row in gathered)]
     columns = [
         Column("run"),
         *map(Column, _TEXTS),
-        *(column for column, _ in _NUMBERS.values()),
+        *(_NUMBERS[key][0] for key in numbers),
         Column("log"),
     ]
-    gathered = _gather_rows(store, manifests) if manifests else []
     noted = list_noted(store)
     rows = [
         {
@@ -321,7 +323,7 @@ def render_catalogue(store: Store) -> str:
             "link": links.get(str(row["run"]), ""),
             "verdict": verdicts.get(str(row["run"]), ""),
             "complete": row["complete"],
-            "cells": list(_list_cells(row)),
+            "cells": list(_list_cells(row, numbers)),
         }
         for row in gathered
     ]
@@ -333,7 +335,11 @@ def render_catalogue(store: Store) -> str:
         columns=columns,
         rows=rows,
         dated=_date_errors(gathered),
-        counts=[f"{count} {name_state(state)}" for state, count in count_logs(noted).items() if count],
+        counts=[
+            f"{count} {'copy' if (state, count) == ('copy', 1) else name_state(state)}"
+            for state, count in count_logs(noted).items()
+            if count
+        ],
         explained=[{**one, "state": name_state(one["state"])} for one in noted if one["state"] != "done"],
     )
 
@@ -440,11 +446,12 @@ def _date_errors(rows: Sequence[Mapping[str, object]]) -> dict[str, object] | No
     return {"points": points, "first": ends[0], "last": ends[1], "most": format_number(most)}
 
 
-def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:
+def _list_cells(row: Mapping[str, object], numbers: Sequence[str]) -> Iterator[tuple[Column, object, object]]:
     """Column, value to sort by, and text of a row's cells."""
     for key in _TEXTS:
         yield Column(key), row[key] or "", row[key] or ""
-    for key, (column, scale) in _NUMBERS.items():
+    for key in numbers:
+        column, scale = _NUMBERS[key]
         value = row[key]
         if isinstance(value, int | float):
             scaled = value * scale
