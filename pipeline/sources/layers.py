@@ -262,8 +262,7 @@ def list_configuration_files(
     A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
     may create one in a folder like `/tmp`.
     """
-    # A link to itself may be ignored, too: `Path.resolve` refuses it.
-    folder = Path(os.path.realpath(log)).parent
+    folder = _resolve(log).parent
     fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
     beside = [folder / RUN_FILE, folder / f"{stem_of(log)}.toml"]
     files = [
@@ -272,6 +271,14 @@ def list_configuration_files(
     files += [] if fleet is None else [fleet]
     own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
     return (*files, *(own if given is None else [given]))
+
+
+def _resolve(log: Path) -> Path:
+    """The path of a log, links resolved; a link to itself, which may be ignored, stays as it is."""
+    try:
+        return log.resolve()
+    except RuntimeError:
+        return log
 
 
 def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
@@ -423,7 +430,7 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
                 "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
         names = _names_under(path.parent.absolute(), listed) + _names_under(
-            path.resolve().parent, Path(os.path.realpath(log))
+            path.resolve().parent, _resolve(log)
         )
         for glob in globs:
             if any(fnmatch.fnmatchcase(name, glob) for name in names):
