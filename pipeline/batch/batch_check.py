@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 from pipeline.batch.batch_plan import forget_pools, measure_results
-from pipeline.batch.batch_work import Entry, Ledger
+from pipeline.batch.batch_work import Entry, Ledger, see_nothing
 from pipeline.core import SlipError
 from pipeline.logs import LogError, hash_log, locate_recorded
 from pipeline.report import count_logs, list_noted
 from pipeline.store import (
+    BATCH_END,
     MANIFEST,
     RUNS,
     UPLOADS,
@@ -233,6 +234,8 @@ class Status:
         old_generations: generations that are not current.
         errors: runs that cannot be read, and folders that were not read.
         last: when a batch last worked on a log [s since 1970]; None if none has.
+        ended: when a batch last ended, whether or not it worked on a log [s since 1970]; None if none has.
+        is_idle: whether that batch worked on no log.
     """
 
     runs: int
@@ -243,6 +246,8 @@ class Status:
     old_generations: int
     errors: tuple[StoreError, ...]
     last: float | None
+    ended: float | None
+    is_idle: bool
 
 
 def read_status(store: Store) -> Status:
@@ -250,12 +255,20 @@ def read_status(store: Store) -> Status:
     survey = store.survey()
     known = Ledger(store).read_all()
     noted = list_noted(store)
+    # What no batch could look at has no entry.
     entries = tuple(
-        replace(known[note["path"]], state=note["state"], reason=note["reason"], hint=note["hint"])
+        replace(
+            known.get(path := note["path"]) or Entry(log=see_nothing(path), fingerprint="", state=""),
+            state=note["state"],
+            reason=note["reason"],
+            hint=note["hint"],
+        )
         for note in noted
-        if note["path"] in known
     )
     size, unread = measure_results(store)
+    folder, name = BATCH_END
+    end = store.notes(folder).read(name) or {}
+    last, began = max((entry.at for entry in entries if entry.at), default=None), end.get("began")
     return Status(
         runs=len(survey.manifests),
         writers=store.list_writers(),
@@ -264,5 +277,7 @@ def read_status(store: Store) -> Status:
         bytes=size,
         old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),
-        last=max((entry.at for entry in entries), default=None),
+        last=last,
+        ended=ended if isinstance(ended := end.get("at"), float) else None,
+        is_idle=isinstance(began, float) and (last or 0.0) < began,
     )

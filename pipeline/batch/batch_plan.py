@@ -14,14 +14,14 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
-from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger, Task
+from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger, Task, see_nothing
+from pipeline.batch.recordings import Recordings
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import find_ignored, list_configuration_files, list_presets, read_tables
 from pipeline.store import (
     LogIdentities,
-    LogSighting,
     Manifest,
     Store,
     StoreError,
@@ -149,11 +149,11 @@ def name_runs(
     return runs, copies
 
 
-def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
+def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
     """Compare the logs with the results.
 
     Args:
-        paths: recordings, absolute, sorted.
+        listed: recordings, absolute, sorted.
         store: the results.
         request: options of the user.
 
@@ -163,9 +163,15 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[li
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
-    ignored = {path: why for path in paths if (why := find_ignored(path, request.options.fleet))}
+    # A pipe or a dead link may be ignored like a log.
+    odd = [each.path for each in listed.skipped if each.is_entry]
+    ignored = {
+        path: why
+        for path in (*listed.recordings, *odd)
+        if (why := find_ignored(listed.name_listed(path), request.options.fleet))
+    }
     settled = [_ignore(path, why, store) for path, why in ignored.items()]
-    paths = [path for path in paths if path not in ignored]
+    paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
     tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
     owners = _find_owners(tasks, manifests)
@@ -189,7 +195,7 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> tuple[li
 
 def _ignore(path: Path, why: str, store: Store) -> Entry:
     """The entry of a log that a fleet file ignores."""
-    log = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0)
+    log = see_nothing(str(path))
     with suppress(OSError, SlipError):
         log = see_log(path)
     entry = Entry(log=log, fingerprint="", state="ignored", reason=why)
@@ -199,7 +205,7 @@ def _ignore(path: Path, why: str, store: Store) -> Entry:
 
 def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options) -> Task:
     # Unreadable logs are processed all the same: this reports what is wrong with them.
-    log, fingerprint = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
+    log, fingerprint = see_nothing(str(path)), ""
     with suppress(OSError, SlipError):
         log = see_log(path)
         fingerprint = hasher.find_fingerprint(path)
@@ -212,7 +218,7 @@ def _find_owners(tasks: Sequence[Task], manifests: Mapping[str, Manifest]) -> di
     owners: dict[str, str] = {}
     for task in sorted(tasks, key=lambda task: task.log.path):
         entry = task.before
-        if entry is not None and entry.state in WITH_RESULTS and entry.run in manifests:
+        if entry is not None and entry.key and entry.state in WITH_RESULTS and entry.run in manifests:
             owners.setdefault(entry.run, task.log.path)
     return owners
 
@@ -227,8 +233,8 @@ def _is_settled(
     manifest = manifests.get(entry.run)
     if manifest is not None and manifest.again:
         return False
-    if entry.state == "quarantined":
-        return not request.retries_quarantined
+    if entry.lasts or entry.state == "quarantined":
+        return entry.lasts or not request.retries_quarantined
     if entry.state == "copy":
         original = manifests.get(entry.reason)
         path = "" if original is None else str(original.part("log").get("path"))

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -14,12 +15,15 @@ from pipeline.batch import Request, Shard
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
-from pipeline.batch.recordings import find_recordings
-from pipeline.core import SlipError
-from pipeline.store import Store
+from pipeline.batch.recordings import Skipped, find_recordings
+from pipeline.core import SlipError, format_count
+from pipeline.store import BATCH_END, JSON, Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that would affect every other log as well."""
+
+FAILED_STATES = ("failed", "quarantined", "not_started")
+"""States of logs that should have results and have none."""
 
 _BUSY_PAUSE_S = 0.25
 _FATAL_KILLS = 2
@@ -54,7 +58,8 @@ class Line:
         hint: what to do.
         seconds: processing time; 0 if there was nothing to do.
         lossy: whether it has results, but the log had losses.
-        refused: whether it has results, but cannot show slip.
+        refused: whether it cannot show slip, with results or without.
+        unchanged: whether an earlier batch came to this, and nothing has changed since.
         peak_bytes: peak memory of its worker.
         size_bytes: size of the log.
         waited_for: who was working on it before; empty without anybody.
@@ -70,10 +75,16 @@ class Line:
     seconds: float = 0.0
     lossy: bool = False
     refused: bool = False
+    unchanged: bool = False
     peak_bytes: int = 0
     size_bytes: int = 0
     waited_for: str = ""
     replaced: str = ""
+
+
+def format_not_started(number: int) -> str:
+    """How many logs were not started, in words."""
+    return f"{format_count(number, 'log')} {'was' if number == 1 else 'were'} not started"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,16 +111,32 @@ class Outcome:
         states = [line.state for line in self.lines]
         return {state: states.count(state) for state in STATES}
 
+    def list_errors(self) -> list[tuple[str, SlipError]]:
+        """The path and the error of each failure, what affects all logs first, the logs it stopped as one."""
+        own = sorted(
+            (line for line in self.lines if line.state in {"failed", "quarantined"}),
+            key=lambda line: (line.code not in STOPPING, line.unchanged, line.path),
+        )
+        waiting = [line for line in self.lines if line.state == "not_started"]
+        errors = [(line.path, SlipError(line.code, line.reason, hint=line.hint)) for line in own]
+        errors += [("", problem) for problem in self.problems]
+        if waiting:
+            what = f"{format_not_started(len(waiting))}: {waiting[0].reason}"
+            hint = "Run the same command again when the cause is removed"
+            errors.append(("", SlipError("not_started", what, hint=hint)))
+        return errors
+
     @property
     def has_failed(self) -> bool:
-        """Whether an item that should have results has none."""
-        is_short = any(line.state in {"failed", "quarantined", "not_started"} for line in self.lines)
-        return is_short or bool(self.problems)
+        """Whether this batch failed: with a log that is new, changed or tried again, or with another step."""
+        return any(line.state in FAILED_STATES and not line.unchanged for line in self.lines) or bool(
+            self.problems
+        )
 
     @property
     def has_losses(self) -> bool:
-        """Whether a log with results had losses or cannot show slip, or a path could not be read."""
-        return any(line.lossy or line.refused or line.state == "left_out" for line in self.lines)
+        """Whether a log had losses, cannot show slip, failed and is unchanged, or could not be read."""
+        return any(line.state in {"lossy", "refused", "left_out", *FAILED_STATES} for line in self.lines)
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
@@ -124,13 +151,38 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         BatchError: there are no such logs, or no workers can be started.
         StoreError: the results cannot be written at all.
     """
+    skipped: list[Skipped] = []
+    began = round(time.time(), 3)
+    try:
+        return _run(request, watch, work, skipped)
+    finally:
+        if request.targets:
+            _note_end(Store(request.options.out), began, skipped)
+
+
+def _note_end(store: Store, began: float, skipped: Sequence[Skipped]) -> None:
+    """Note that a batch ended, also where all logs were unchanged; a disk without room is told elsewhere."""
+    folder, name = BATCH_END
+    paths: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
+    with suppress(SlipError):
+        if store.root.is_dir():
+            store.notes(folder).write(name, {"began": began, "at": round(time.time(), 3), "left_out": paths})
+
+
+def _run(request: Request, watch: Watch, work: Callable[[Task], Report], skipped: list[Skipped]) -> Outcome:
+    """The batch; `skipped` gets the paths that could not be looked at."""
     started = time.monotonic()
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    planned, settled = make_plan(listed.recordings, store, request)
+    planned, settled = make_plan(listed, store, request)
+    ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
+    skipped += (each for each in listed.skipped if str(each.path) not in ignored)
+    if request.targets:
+        _note_end(store, time.time(), skipped)
     todo = _select(planned, request.shard)
-    watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
+    if request.targets:
+        watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
     lines = [*map(_settle, settled)]
     waited: dict[str, str] = {}
 
@@ -147,13 +199,15 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
 
     remaining = _work_through(todo, request, work, note)
     problems, removed = _tidy_up(store, request)
-    not_started = "not started: see the other errors"
+    # Only an error that affects every log leaves some.
+    cause = next((line.reason for line in lines if line.code in STOPPING), "")
     lines += [
-        Line(path=one.log.path, run=one.run, state="not_started", reason=not_started) for one in remaining
+        Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
+        for one in remaining
     ]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
-    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in listed.skipped]
+    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in skipped]
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -253,8 +307,8 @@ def _settle(entry: Entry) -> Line:
     """Line of a log that there is nothing to do for."""
     if entry.state == "copy":
         reason = f"the same content as {entry.reason}"
-        return Line(path=entry.log.path, run=entry.reason, state="copy", reason=reason)
-    return _make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False)
+        return Line(path=entry.log.path, run=entry.reason, state="copy", reason=reason, unchanged=True)
+    return replace(_make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False), unchanged=True)
 
 
 def _make_line(entry: Entry, *, is_new: bool) -> Line:

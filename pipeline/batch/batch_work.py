@@ -14,6 +14,9 @@ import msgspec
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
 from pipeline.core import LONGEST_TEXT, SlipError, objects_in, shorten
+from pipeline.logs import LogError
+from pipeline.recording import RecordingError, StageError
+from pipeline.sources import ConfigurationError
 from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Store, stored_contexts
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
@@ -24,6 +27,31 @@ from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Sto
 STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "not_started")
 """What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
+
+_OF_THE_PLACE = {"log_not_found", "log_unreachable", "log_changed", "no_object_store"}
+"""Errors of a log whose cause is where it is, not what it holds."""
+_NOT_RECORDED = {
+    "log_without_messages",
+    "no_pose",
+    "no_command",
+    "no_wheels",
+    "no_gyro",
+    "no_clock",
+    "no_interval",
+    "no_segment",
+    "empty_interval",
+}
+"""Errors of a log that is as it was recorded, but without what slip is computed from."""
+
+
+def judge_error(error: SlipError) -> tuple[str, bool]:
+    """What a log comes out as after an error, and whether it stays so until it or its fingerprint changes.
+
+    An error of a full disk, a lost worker or an unreachable store does not stay: the next batch tries again.
+    """
+    kinds = (LogError, RecordingError, StageError, ConfigurationError)
+    lasts = isinstance(error, kinds) and error.code not in _OF_THE_PLACE
+    return "refused" if lasts and error.code in _NOT_RECORDED else "failed", lasts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +67,7 @@ class Entry:
         code: code of the error.
         reason: reason of the failure or refusal, or what was lost; of a copy, the run it is a copy of.
         hint: what to do about it.
+        lasts: whether an error stays until the log or its fingerprint changes (`judge_error`).
         kills: number of workers it has killed in this state.
         has_report: whether the generation contains a report.
         seconds: processing time.
@@ -54,6 +83,7 @@ class Entry:
     code: str = ""
     reason: str = ""
     hint: str = ""
+    lasts: bool = False
     kills: int = 0
     has_report: bool = False
     seconds: float = 0.0
@@ -63,6 +93,11 @@ class Entry:
     def fits(self, log: LogSighting, fingerprint: str) -> bool:
         """Whether neither the log nor its fingerprint has changed."""
         return self.log.is_same_file(log) and self.fingerprint == fingerprint
+
+
+def see_nothing(path: str) -> LogSighting:
+    """The sighting of a log that cannot be looked at."""
+    return LogSighting(path=path, size=0, mtime_ns=0, inode=0, seen_ns=0)
 
 
 class Ledger:
@@ -176,7 +211,10 @@ def work_on(task: Task) -> Report:
             entry, is_new, replaced = _analyze(task, entry)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
-        entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
+        state, lasts = judge_error(error)
+        entry = replace(
+            entry, state=state, lasts=lasts, code=error.code, reason=f"{where}{error.what}", hint=error.hint
+        )
     except Exception as error:  # noqa: BLE001 - one log must not cost the others
         entry = _note_surprise(entry, error)
     entry = replace(

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.batch import BatchError
-from pipeline.batch.batch_run import Outcome
+from pipeline.batch.batch_run import Outcome, format_not_started
 from pipeline.core import make_plain, shorten
 from pipeline.store import Store
 
 _NOTIFY_S = 120.0
 """Time that the command of the user may take [s]: mail servers that do not answer give up after a minute."""
-_NEWS = {"lossy", "refused", "failed", "quarantined", "not_started", "left_out"}
+_NEWS = {"lossy", "refused", "failed", "quarantined", "left_out"}
 
 
 def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
@@ -29,6 +29,12 @@ def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
         for line in outcome.lines
         if line.state in _NEWS
     }
+    # Those that were not started have one cause, which stands before them.
+    waiting = [line for line in outcome.lines if line.state == "not_started"]
+    if waiting:
+        raised[f"not_started {waiting[0].reason}"] = (
+            f"{format_not_started(len(waiting))}: {waiting[0].reason}"
+        )
     raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
     notes = Store(root).notes("batch/notified")
     sent = notes.read("sent") or {}

@@ -33,6 +33,11 @@ class Skipped:
     path: Path
     reason: str
 
+    @property
+    def is_entry(self) -> bool:
+        """Whether its folder was read, and it is no file: nothing waits for an answer."""
+        return self.reason in {NO_FILE, *_DEAD}
+
 
 @dataclass(frozen=True)
 class Folder:
@@ -58,10 +63,14 @@ class Looker:
     Attributes:
         patience_s: time limit of one access [s].
         skipped: paths that could not be read.
+        tops: folders that were asked for; links resolved.
+        links: the link by which each path outside of them was found.
     """
 
     patience_s: float
     skipped: list[Skipped] = field(default_factory=list)
+    tops: list[Path] = field(default_factory=list)
+    links: dict[Path, Path] = field(default_factory=dict)
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
         """Result of a query about a path; None, with a note in `skipped`, if there is none."""
@@ -136,12 +145,15 @@ class Looker:
             kind, leads_to = known
             if kind in kinds:
                 kinds[kind][entry.name] = leads_to
+                if leads_to != path and not any(map(leads_to.is_relative_to, self.tops)):
+                    self.links.setdefault(leads_to, path)
             # A link that leads nowhere, of another suffix, was one to neither a log nor a folder.
             elif entry.name.endswith(SUFFIXES) or (kind in _DEAD and not path.suffix):
                 self.skip(path, kind)
         return Folder(folder, kinds["folder"], kinds["file"], identity)
 
 
+NO_FILE = "it is a pipe, a socket or a device, not a file"
 _DEAD = (_TO_NOTHING, _TO_ITSELF) = ("it is a link to nothing", "it is a link to itself")
 
 
@@ -169,7 +181,7 @@ def _find_kind(entry: os.DirEntry[str]) -> str:
         return "file"
     if entry.is_symlink() and not os.path.exists(entry.path):  # noqa: PTH110 - not of a path, but of an entry
         return _TO_NOTHING
-    return "it is a pipe, a socket or a device, not a file"
+    return NO_FILE
 
 
 _GLOB = re.compile(r"[*?\[]")
@@ -189,11 +201,21 @@ class Recordings:
         recordings: files, and folders of split recordings, absolute, sorted.
         growing: recordings that are still being written.
         skipped: skipped paths with reasons: folders that cannot be read, pipes, broken links.
+        links: the link by which each path outside of the folders was found.
     """
 
     recordings: tuple[Path, ...]
     growing: tuple[Path, ...] = field(default=())
     skipped: tuple[Skipped, ...] = field(default=())
+    links: Mapping[Path, Path] = field(default_factory=dict, compare=False)
+
+    def name_listed(self, path: Path) -> Path:
+        """The path of a recording as its folder lists it: by the links that lead to it."""
+        for part in (path, *path.parents):
+            link = self.links.get(part)
+            if link is not None and not link.is_relative_to(part):
+                return self.name_listed(link) / path.relative_to(part)
+        return path
 
 
 def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: float = PATIENCE_S) -> Recordings:
@@ -207,14 +229,15 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         patience_s: time limit of one access to a file or folder [s].
 
     Raises:
-        BatchError: ``logs_not_found``: a target or all of them hold nothing; ``list_unreadable``.
-        LogError: ``log_unreadable``, an object store does not answer.
+        BatchError: ``logs_not_found``: a target or all of them hold nothing, where there are any;
+            ``list_unreadable``.
+        LogError: ``log_unreachable``, an object store does not answer.
     """
     looker = Looker(patience_s)
     listed: set[Path] = set()
     for target in _expand_lists(targets):
         listed |= set(_find_in(target, looker))
-    if not listed and not looker.skipped:
+    if targets and not listed and not looker.skipped:
         raise _refuse(", ".join(targets))
     growing = _find_growing(listed, settle_s, looker)
     silent = {each.path for each in looker.skipped}
@@ -223,6 +246,7 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         tuple(sorted(listed - growing - silent)),
         tuple(sorted(growing - silent)),
         tuple(skipped[path] for path in sorted(skipped)),
+        looker.links,
     )
 
 
@@ -287,13 +311,14 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
     if real is not None and looker.ask(real, real.is_file):
         yield real
     elif real is not None and looker.ask(real, real.is_dir):
+        looker.tops.append(real)
         for folder in looker.walk(real):
             yield from _list_recordings(folder, looker)
     elif _GLOB.search(target):
         for match in looker.expand(path):
             yield from _find_match(match, looker)
     elif real is not None and looker.ask(real, real.exists):
-        looker.skip(real, "it is a pipe, a socket or a device, not a file")
+        looker.skip(real, NO_FILE)
     elif len(looker.skipped) == before:
         hint = "Check the path; quote a glob so that the shell does not expand it"
         raise BatchError("logs_not_found", "there is no such file or folder", where=target, hint=hint)

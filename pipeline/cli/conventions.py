@@ -144,18 +144,42 @@ EXPLAINED = ("refused", "lossy", "failed", "quarantined", "ignored", "growing", 
 """States of logs that need a look, in the order in which they are listed."""
 
 
-def explain_logs(title: str, logs: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Paths of logs, why they came out so, and what to do, below a title; nothing without any."""
+_NAMED = 3
+"""Logs of one reason that are named: a folder of copies may have hundreds."""
+
+
+def group_reasons(logs: Iterable[tuple[str, str, str]]) -> list[tuple[list[str], str, str]]:
+    """Paths of logs by their reason, the most frequent first, with the first hint.
+
+    Args:
+        logs: path, reason and hint of each.
+    """
+    groups: dict[str, tuple[list[str], str]] = {}
+    for path, reason, hint in logs:
+        groups.setdefault(reason, ([], hint))[0].append(path)
+    ordered = sorted(groups.items(), key=lambda item: -len(item[1][0]))
+    return [(paths, reason, hint) for reason, (paths, hint) in ordered]
+
+
+def name_some(paths: Sequence[str], *, everything: bool = False) -> list[str]:
+    """Paths to be shown; of many the first, and how many others there are."""
+    if everything or len(paths) <= _NAMED + 1:
+        return list(paths)
+    return [*paths[:_NAMED], f"and {len(paths) - _NAMED} more (--all lists them)"]
+
+
+def explain_logs(title: str, logs: Iterable[tuple[str, str, str]], *, everything: bool = False) -> list[str]:
+    """Paths of logs by why they came out so, and what to do, below a title; nothing without any."""
     lines = [
         text
-        for path, reason, hint in logs
+        for paths, reason, hint in group_reasons(logs)
         for text in (
-            f"  {path}",
+            *(f"  {path}" for path in name_some(paths, everything=everything)),
             f"      {shorten(reason, LONGEST_TEXT)}",
             *([f"      {hint}"] if hint else []),
         )
     ]
-    return ["", title, *lines] if lines else []
+    return [title, *lines, ""] if lines else []
 
 
 def format_value(value: object) -> str:

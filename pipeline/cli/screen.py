@@ -76,7 +76,9 @@ class LineWatch:
         self._read += size
         state = name_state(line.state)
         what = f"{state}: {line.reason}" if line.reason else state
-        remaining = f", about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+        remaining = (
+            f", about {format_duration(round(self.estimate_rest()))} left" if self._done < self._todo else ""
+        )
         print_note(
             f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){remaining}"
         )

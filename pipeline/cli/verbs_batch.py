@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,25 +26,27 @@ from pipeline.cli.conventions import (
     EXPLAINED,
     FAILED,
     LOSSY,
+    All,
     Asked,
     Choices,
     build_options,
     explain_logs,
     format_counts,
+    group_reasons,
+    name_some,
     open_results,
     print_error,
     print_json,
     print_lines,
+    print_note,
     summarize_error,
 )
-from pipeline.core import SlipError, measure_memory, name_state
+from pipeline.core import SlipError, UsageError, measure_memory, name_state
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Outcome
 
 _MEMORY_SHARE = 0.8
-_MOST_REPLACED = 3
-"""Logs whose earlier results were replaced that are named: with another option these are all of a season."""
 
 
 def batch(  # noqa: D417 - the shared choices document themselves
@@ -64,13 +71,14 @@ def batch(  # noqa: D417 - the shared choices document themselves
     prune: bool = False,
     keep: NonNegativeInt = 1,
     quota: str | None = None,
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Analyze the new and changed logs of a folder.
 
     The same command again continues. Exit codes: 0 all done; 1 a log or a step failed; 3 done, but a log had
-    losses, cannot show slip, or could not be looked at.
+    losses, cannot show slip, could not be looked at, or failed before and is unchanged; 130 or 143 stopped.
 
     Args:
         jobs: logs processed in parallel (default: the cores it may use).
@@ -87,15 +95,17 @@ def batch(  # noqa: D417 - the shared choices document themselves
         quota: with --prune, size of the results above which the oldest go first, for example 200GB.
         notify: command line for the shell that gets the JSON object on its standard input when something is
             new: a log that failed, had losses or cannot show slip, or another error.
+        everything: name every log, also of many with the same reason.
         json: print one JSON object.
-        quiet: print nothing but errors.
+        quiet: print nothing but errors, each reason once.
     """
     from pipeline.cli.screen import open_watch  # noqa: PLC0415 - only for this verb
 
     if not logs and not prune:
-        raise SlipError("no_logs", "no log is given", hint="Give logs: slip batch LOGS, a folder or a glob")
+        hint = "Give logs: slip batch LOGS, a folder or a glob"
+        raise UsageError("no_logs", "no log is given", hint=hint)
     if quota is not None and not prune:
-        raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
+        raise UsageError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
     if not logs:
@@ -118,7 +128,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     from pipeline.batch.batch_run import Outcome, run_batch  # noqa: PLC0415 - heavy
 
     try:
-        with open_watch(quiet=quiet or json) as watch:
+        with _ending_on_signals(), open_watch(quiet=quiet or json) as watch:
             outcome = run_batch(request, watch)
     except Exception as error:
         # No logs, a full disk: nobody looks at the screen of a night.
@@ -135,8 +145,36 @@ def batch(  # noqa: D417 - the shared choices document themselves
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
-        print_lines(format_outcome(outcome, is_search=bool(logs)))
+        print_lines(format_outcome(outcome, is_search=bool(logs), everything=everything))
+    if json or quiet:
+        _print_failures(outcome)
     return FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
+
+
+@contextmanager
+def _ending_on_signals() -> Iterator[None]:
+    """End with one line and 128 plus the number of the signal, as shells do, when the batch is stopped."""
+
+    def end(number: int, _frame: object) -> None:
+        print_note("slip: stopped; the same command continues")
+        sys.exit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _print_failures(outcome: Outcome) -> None:
+    """One line on stderr for each reason of logs that failed in this batch."""
+    new = [line for line in outcome.lines if line.state in {"failed", "quarantined"} and not line.unchanged]
+    for paths, reason, hint in group_reasons((line.path, line.reason, line.hint) for line in new):
+        print_error(SlipError("failed", reason, where=", ".join(name_some(paths)), hint=hint))
 
 
 def _report(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
@@ -163,25 +201,30 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
         "notified": list(outcome.notified),
-        "errors": [summarize_error("", problem) for problem in outcome.problems],
+        "errors": [summarize_error(path, error) for path, error in outcome.list_errors()],
     }
 
 
-def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
-    """The closing table: how many logs came out how, and of those that need a look, why.
+def format_outcome(outcome: Outcome, *, is_search: bool = True, everything: bool = False) -> list[str]:
+    """The logs that need a look, and why, what is new last, and below them how many logs came out how.
 
     Results that were made with other options are said to be replaced.
     """
-    lines = format_counts(outcome.counts, width=6)
-    if outcome.removed or not is_search:
-        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    for state in (*EXPLAINED, "copy"):
-        own = [(line.path, line.reason, line.hint) for line in outcome.lines if line.state == state]
-        lines += explain_logs(name_state(state), own)
+    lines: list[str] = []
+    for is_old in (True, False):
+        for state in (*EXPLAINED, "not_started", "copy"):
+            own = [
+                (line.path, line.reason, line.hint)
+                for line in outcome.lines
+                if line.state == state and line.unchanged == is_old
+            ]
+            title = f"{name_state(state)}, {'as before' if is_old else 'new'}"
+            lines += explain_logs(title, own, everything=everything)
     replaced = [
         (line.path, f"earlier results, {line.replaced}", "") for line in outcome.lines if line.replaced
     ]
-    lines += explain_logs("replaced", replaced[:_MOST_REPLACED])
-    others = len(replaced) - _MOST_REPLACED
-    lines += [f"  and {others} more (--json lists them)"] if others > 0 else []
+    lines += explain_logs("replaced", replaced, everything=everything)
+    lines += format_counts(outcome.counts, width=6)
+    if outcome.removed or not is_search:
+        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     return lines

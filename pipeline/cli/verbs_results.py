@@ -18,10 +18,12 @@ from pipeline.cli.conventions import (
     CLEAN,
     EXPLAINED,
     FAILED,
+    All,
     Results,
     explain_logs,
     format_counts,
     open_results,
+    print_error,
     print_result,
     show_progress,
     summarize_error,
@@ -146,6 +148,7 @@ def status(  # noqa: D417 - arguments document themselves
     /,
     *,
     results: Results = Path("results"),
+    everything: All = False,
     json: bool = False,
 ) -> int:
     """Show the state of all logs, or the log, configuration and corrections behind the numbers of one run.
@@ -153,6 +156,7 @@ def status(  # noqa: D417 - arguments document themselves
     Exit codes: 0 the results could be read, whatever became of their logs; 1 some of them cannot be read.
 
     Args:
+        everything: name every log, also of many with the same reason.
         json: print one JSON object.
     """
     from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
@@ -164,7 +168,7 @@ def status(  # noqa: D417 - arguments document themselves
         content = {"run": manifest.run, "key": manifest.key, "writing": writer, **manifest.details}
         return print_result(content, lambda: _format_origin(manifest, writer), json=json)
     status_now = read_status(folder)
-    print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
+    print_result(_as_json(status_now), lambda: _format_status(status_now, everything=everything), json=json)
     return FAILED if status_now.errors else CLEAN
 
 
@@ -175,6 +179,7 @@ def _as_json(status_now: Status) -> dict[str, object]:
         "bytes": status_now.bytes,
         "old_generations": status_now.old_generations,
         "last": status_now.last,
+        "ended": status_now.ended,
         "writing": [{"run": run, "holder": holder} for run, holder in status_now.writers.items()],
         "logs": [
             {"path": entry.log.path, **{k: v for k, v in asdict(entry).items() if k != "log"}}
@@ -184,24 +189,24 @@ def _as_json(status_now: Status) -> dict[str, object]:
     }
 
 
-def _format_status(status_now: Status) -> list[str]:
-    last = (
-        "never"
-        if status_now.last is None
-        else f"{datetime.fromtimestamp(status_now.last).astimezone():%Y-%m-%d %H:%M}"
-    )
+def _format_time(at: float | None) -> str:
+    return "never" if at is None else f"{datetime.fromtimestamp(at).astimezone():%Y-%m-%d %H:%M}"
+
+
+def _format_status(status_now: Status, *, everything: bool) -> list[str]:
+    last, worked = _format_time(status_now.ended), _format_time(status_now.last)
     old = format_count(status_now.old_generations, "old generation")
-    lines = [
+    lines: list[str] = []
+    for state in EXPLAINED:
+        own = [(one.log.path, one.reason, one.hint) for one in status_now.entries if one.state == state]
+        lines += explain_logs(name_state(state), own, everything=everything)
+    lines += [f"damaged: {error}" for error in status_now.errors]
+    lines += [
         f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
-        f"last batch    {last}",
+        f"last batch    {last}{f' (the last that worked on a log: {worked})' if status_now.is_idle else ''}",
         *(f"writing       {run}, by {holder}" for run, holder in status_now.writers.items()),
     ]
-    lines += format_counts(status_now.counts)
-    for state in EXPLAINED:
-        own = [one for one in status_now.entries if one.state == state]
-        lines += explain_logs(name_state(state), [(one.log.path, one.reason, one.hint) for one in own])
-    lines += [f"damaged: {error}" for error in status_now.errors]
-    return lines
+    return lines + format_counts(status_now.counts)
 
 
 def verify(  # noqa: D417 - arguments document themselves
@@ -224,7 +229,7 @@ def verify(  # noqa: D417 - arguments document themselves
         seed: seed of the sample (default: another one every day).
         repair: mark what can be recomputed, for the next batch over its log.
         json: print one JSON object.
-        quiet: print nothing.
+        quiet: print nothing but errors.
     """
     from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
 
@@ -245,7 +250,12 @@ def verify(  # noqa: D417 - arguments document themselves
         json=json,
         quiet=quiet,
     )
-    return CLEAN if verification.is_clean else FAILED
+    if verification.is_clean:
+        return CLEAN
+    if quiet:
+        what = f"{format_count(len(verification.files) + len(verification.logs), 'file')} changed or damaged"
+        print_error(SlipError("damaged", what, where=str(results), hint="Name them: slip results verify"))
+    return FAILED
 
 
 def parse_sample(text: str | None, seed: str | None) -> store.Sample | None:

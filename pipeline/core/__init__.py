@@ -38,6 +38,7 @@ from pipeline.core.text import (
     NORMAL_95,
     FigureFormat,
     SlipError,
+    UsageError,
     align_rows,
     count_places,
     enumerate_texts,

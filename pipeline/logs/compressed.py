@@ -47,8 +47,8 @@ def open_inflated(path: Path, descriptor: int) -> int:
         descriptor: of the open file.
 
     Raises:
-        LogError: ``log_unreadable``, it is damaged or cut off, or there is no room for its content;
-            ``too_large``.
+        LogError: ``log_unreadable``, it is damaged or cut off; ``log_unreachable``, there is no room for its
+            content; ``too_large``.
     """
     status = os.fstat(descriptor)
 
@@ -79,7 +79,7 @@ def _inflate(path: Path, size: int, source: IO[bytes], target: IO[bytes]) -> Non
     except OSError as error:
         what = f"its content cannot be unpacked into {tempfile.gettempdir()} ({error.strerror})"
         hint = "Set TMPDIR to a folder with more room, or unpack it: zstd -d"
-        raise LogError("log_unreadable", what, where=str(path), hint=hint) from None
+        raise LogError("log_unreachable", what, where=str(path), hint=hint) from None
     if frame is None or not frame.eof:
         raise _refuse_damage(path, "cut off", total)
 

@@ -64,7 +64,7 @@ class FileSource(AbstractContextManager["FileSource"]):
         name: the path.
 
     Raises:
-        LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``.
+        LogError: ``log_not_found``, ``log_unreachable``, ``log_unreadable``, ``log_empty``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,7 +82,7 @@ class FileSource(AbstractContextManager["FileSource"]):
             raise LogError("log_not_found", "there is no such file", where=str(path), hint=hint) from None
         except OSError as error:
             what = f"the file cannot be opened ({error.strerror})"
-            raise LogError("log_unreadable", what, where=self.name, hint="Check its permissions") from None
+            raise LogError("log_unreachable", what, where=self.name, hint="Check its permissions") from None
         status = os.fstat(self._descriptor)
         self.size = status.st_size
         if not stat.S_ISREG(status.st_mode):
@@ -114,7 +114,7 @@ class FileSource(AbstractContextManager["FileSource"]):
         except OSError as error:
             what = f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})"
             hint = "Copy the file from its origin again"
-            raise LogError("log_unreadable", what, where=self.name, hint=hint) from None
+            raise LogError("log_unreachable", what, where=self.name, hint=hint) from None
         return data
 
     def close(self) -> None:

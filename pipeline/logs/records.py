@@ -19,6 +19,7 @@ class LogError(SlipError):
     """A log, topic or field that cannot be read.
 
     Codes: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``,
+    ``log_unreachable`` (its disk or store does not give it, for now),
     ``topic_not_found``, ``field_not_found``, ``frame_not_found``, ``unknown_type``, ``bad_column``,
     ``unsupported_encoding``, ``no_object_store``.
     """

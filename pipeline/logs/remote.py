@@ -97,7 +97,7 @@ def _name_errors(url: str) -> Iterator[None]:
     except Exception as error:  # noqa: BLE001 - credentials, host names, XML: no common type
         said = " ".join(str(error).split()) or type(error).__name__
         raise LogError(
-            "log_unreadable",
+            "log_unreachable",
             f"the object cannot be read ({said})",
             where=url,
             hint="Check the network, your credentials (AWS_ACCESS_KEY_ID, AWS_PROFILE, AWS_ENDPOINT_URL) "

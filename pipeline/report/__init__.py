@@ -36,11 +36,23 @@ from pipeline.core import (
     mapping_in,
     name_state,
     naming_os_errors,
+    objects_in,
     shorten,
     suffix_unit,
 )
 from pipeline.recording import Finding
-from pipeline.store import LOG_NOTES, LOG_STATES, Manifest, Store, date_runs
+from pipeline.store import (
+    BATCH_END,
+    LOG_NOTES,
+    LOG_STATES,
+    MANIFEST,
+    RUNS,
+    Manifest,
+    Store,
+    date_runs,
+    encode_run,
+    recorded_path,
+)
 from pipeline.words import NOTHING, Column
 
 if TYPE_CHECKING:
@@ -295,13 +307,15 @@ def render_catalogue(store: Store) -> str:
     }
     # Results may be untrusted: texts may have any length.
     verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
+    gathered = _gather_rows(store, manifests) if manifests else []
+    # Columns that no run has a number for would only make the table wide.
+    numbers = [key for key in _NUMBERS if any(isinstance(row[key], int | float) for row in gathered)]
     columns = [
         Column("run"),
         *map(Column, _TEXTS),
-        *(column for column, _ in _NUMBERS.values()),
+        *(_NUMBERS[key][0] for key in numbers),
         Column("log"),
     ]
-    gathered = _gather_rows(store, manifests) if manifests else []
     noted = list_noted(store)
     rows = [
         {
@@ -309,7 +323,7 @@ def render_catalogue(store: Store) -> str:
             "link": links.get(str(row["run"]), ""),
             "verdict": verdicts.get(str(row["run"]), ""),
             "complete": row["complete"],
-            "cells": list(_list_cells(row)),
+            "cells": list(_list_cells(row, numbers)),
         }
         for row in gathered
     ]
@@ -321,7 +335,11 @@ def render_catalogue(store: Store) -> str:
         columns=columns,
         rows=rows,
         dated=_date_errors(gathered),
-        counts=[f"{count} {name_state(state)}" for state, count in count_logs(noted).items() if count],
+        counts=[
+            f"{count} {'copy' if (state, count) == ('copy', 1) else name_state(state)}"
+            for state, count in count_logs(noted).items()
+            if count
+        ],
         explained=[{**one, "state": name_state(one["state"])} for one in noted if one["state"] != "done"],
     )
 
@@ -330,7 +348,8 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     """What became of each log, by path: ``path state reason hint``; without those since removed or moved.
 
     Of several logs of one run the first that is there counts, and the others are copies of it; where none is
-    there any more, the first is gone. One of which nobody can say whether it is there is left out.
+    there any more, the first is gone; without results it does not count. One of which nobody can say whether
+    it is there is left out, as are the paths that the last batch could not look at.
     """
     noted: list[dict[str, str]] = []
     absent: list[tuple[str, str, str, str]] = []
@@ -339,12 +358,14 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     existing = find_existing((path for path in sorted(notes) if "://" not in path), _PATIENCE_S)
     for path, note in sorted(notes.items()):
         texts = {key: shorten(str(note.get(key) or ""), LONGEST_TEXT) for key in ("state", "reason", "hint")}
-        run, has_run = str(note.get("run") or ""), texts["state"] not in _WITHOUT_RUN
+        # A log that cannot show slip has results or none.
+        run = str(note.get("run") or "")
+        has_run = bool(note.get("key")) and texts["state"] not in _WITHOUT_RUN
         is_there = existing.get(path, True)
         if is_there is not True:
             if is_there:
                 absent.append((path, run if has_run else "", "left_out", is_there))
-            elif has_run:
+            elif has_run and (store.root / RUNS / encode_run(run) / MANIFEST).exists():
                 absent.append((path, run, "gone", _GONE))
             continue
         if has_run and run in holders:
@@ -356,6 +377,13 @@ def list_noted(store: Store) -> list[dict[str, str]]:
         if not run or run not in holders:
             holders.add(run)
             noted.append({"path": path, "state": state, "reason": reason, "hint": ""})
+    folder, name = BATCH_END
+    known = {one["path"] for one in noted}
+    noted += [
+        {"path": str(one["path"]), "state": "left_out", "reason": str(one["reason"]), "hint": ""}
+        for one in objects_in(store.notes(folder).read(name) or {}, "left_out")
+        if one.get("path") not in known
+    ]
     return sorted(noted, key=lambda one: one["path"])
 
 
@@ -418,11 +446,12 @@ def _date_errors(rows: Sequence[Mapping[str, object]]) -> dict[str, object] | No
     return {"points": points, "first": ends[0], "last": ends[1], "most": format_number(most)}
 
 
-def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:
+def _list_cells(row: Mapping[str, object], numbers: Sequence[str]) -> Iterator[tuple[Column, object, object]]:
     """Column, value to sort by, and text of a row's cells."""
     for key in _TEXTS:
         yield Column(key), row[key] or "", row[key] or ""
-    for key, (column, scale) in _NUMBERS.items():
+    for key in numbers:
+        column, scale = _NUMBERS[key]
         value = row[key]
         if isinstance(value, int | float):
             scaled = value * scale
@@ -474,7 +503,7 @@ def is_page(path: str) -> bool:
 
 def lead_up(run: str, page: str = CATALOGUE) -> str:
     """Address of a page of the results, by default the catalogue, relative to the report of a run."""
-    return "../" * (run.count("/") + 3) + quote(page)
+    return "../" * (len(encode_run(run).parts) + 2) + quote(page)
 
 
 def lead_to(results: Path, folder: Path) -> str:

@@ -262,7 +262,7 @@ def list_configuration_files(
     A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
     may create one in a folder like `/tmp`.
     """
-    folder = log.resolve().parent
+    folder = _resolve(log).parent
     fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
     beside = [folder / RUN_FILE, folder / f"{stem_of(log)}.toml"]
     files = [
@@ -271,6 +271,14 @@ def list_configuration_files(
     files += [] if fleet is None else [fleet]
     own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
     return (*files, *(own if given is None else [given]))
+
+
+def _resolve(log: Path) -> Path:
+    """The path of a log, links resolved; a link to itself, which may be ignored, stays as it is."""
+    try:
+        return log.resolve()
+    except RuntimeError:
+        return log
 
 
 def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
@@ -408,7 +416,11 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
     Raises:
         ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
-    for path in list_configuration_files(log, fleet=fleet):
+    # As it is listed: a link in the folder of the fleet file may lead out of it.
+    listed = Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
+    above = [folder / FLEET_FILE for folder in reversed(listed.parents)]
+    files = [file for file in above if file.is_file() and _may_speak(file, listed.parent)]
+    for path in dict.fromkeys([*files, *list_configuration_files(log, fleet=fleet)]):
         if path != fleet and path.name != FLEET_FILE:
             continue
         globs = read_toml(path).get("ignore", [])
@@ -417,7 +429,9 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
             raise ConfigurationError(
                 "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
-        names = _names_under(path.resolve().parent, log.resolve())
+        names = _names_under(path.parent.absolute(), listed) + _names_under(
+            path.resolve().parent, _resolve(log)
+        )
         for glob in globs:
             if any(fnmatch.fnmatchcase(name, glob) for name in names):
                 return f'{path}: ignore = "{glob}"'

@@ -26,7 +26,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
-            "checksums": ("LOG_NOTES", "LOG_STATES"),
+            "checksums": ("BATCH_END", "LOG_NOTES", "LOG_STATES"),
             "files": (
                 "hold_lock",
                 "make_folder",
@@ -83,6 +83,7 @@ else:
                 "name_run",
                 "read_choices",
                 "read_length_scale",
+                "recorded_path",
                 "see_log",
                 "stored_contexts",
                 "stored_keys",

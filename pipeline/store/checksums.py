@@ -70,6 +70,8 @@ def decode_checked(data: bytes) -> dict[str, object]:
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs."""
+BATCH_END = "batch/ended", "last"
+"""Folder and name of the note on the last batch: ``began`` and ``at`` [s since 1970], and ``left_out``."""
 LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored", "left_out", "gone")
 """What became of a log of a batch; each log counts once, and each run has one log."""
 

@@ -50,7 +50,7 @@ def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
     }
     page = unescape((folder / "season" / "index.html").read_text())
     (line,) = re.findall(r"Logs of batches: (.*)\.</p>", page)
-    assert line == "1 done, 1 with losses, 1 failed, 1 copies, 1 ignored"
+    assert line == "1 done, 1 with losses, 1 failed, 1 copy, 1 ignored"
     assert all(name in page for name in ("cut.mcap", "text.mcap", "dead.mcap"))
     screen = run_verb(*words[:8], cwd=folder).stdout
     assert re.search(r"^ignored +1$", screen, re.MULTILINE)
@@ -130,3 +130,16 @@ def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> 
     assert (dated["first"], dated["last"], dated["most"]) == ("2026-05-01", "2026-05-04", "2.00")
     assert [one["x"] for one in dated["points"]] == pytest.approx([0.0, 1 / 3, 1.0])
     assert [one["ideal"] for one in dated["points"]] == pytest.approx([0.25, 0.5, 1.0])
+
+
+def test_links_are_ignored_as_they_are_listed(folder: Path) -> None:
+    """A linked folder, a dead link and a pipe that a glob matches are not left out."""
+    (folder / "other" / "inside").mkdir(parents=True)
+    (folder / "other" / "inside" / "x.mcap").write_text("no recording\n" * 100)
+    (folder / "field" / "robot").symlink_to(folder / "other")
+    (folder / "field" / "lost.mcap").symlink_to("nothing")
+    os.mkfifo(folder / "field" / "pipe.mcap")
+    (folder / "field" / "fleet.toml").write_text('ignore = ["dead*", "robot/*", "lost*", "pipe*"]\n')
+    words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season", "--json")
+    told = json.loads(run_verb(*words, cwd=folder).stdout)
+    assert (told["ignored"], told["left_out"]) == (4, 0)

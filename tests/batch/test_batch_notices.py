@@ -42,7 +42,7 @@ def test_what_is_new_is_told_once_as_the_json_of_the_batch(field: Path, original
     broken, cut = answer["notified"]
     assert "broken.mcap: it is a text, not an MCAP file" in broken
     assert "cut.mcap: the chunk" in cut
-    assert ask_verb(*words, code=1)["notified"] == []
+    assert ask_verb(*words, code=3)["notified"] == []
     assert count_told() == 1
 
     (field / "other.mcap").write_bytes(b"nor this" * 1000)
@@ -56,7 +56,7 @@ def test_what_is_new_is_told_once_as_the_json_of_the_batch(field: Path, original
     assert run_slip(*words)[0] == 3
     assert count_told() == 2
     Path("broken").rename(field / "broken.mcap")
-    assert run_slip(*words)[0] == 1
+    assert run_slip(*words)[0] == 3
     assert count_told() == 3
 
 

@@ -126,7 +126,7 @@ def test_a_store_without_credentials_or_out_of_reach_is_said_in_one_line(
         type(bucket).clear_instance_cache()
         with pytest.raises(LogError, match=why) as caught:
             open_log(f"{BUCKET}/logs/a.mcap")
-        assert caught.value.code == "log_unreadable"
+        assert caught.value.code == "log_unreachable"
         assert len(str(caught.value).splitlines()) == 1
         assert "AWS_ACCESS_KEY_ID" in caught.value.hint
 

@@ -1,0 +1,162 @@
+"""A batch of every night: what it keeps, what it tells and how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from batch_tools import IMPORTABLE, batch, counts
+from batch_works import work_on_full_disk
+from mcap.writer import Writer
+from verbs import ask_verb, run_slip
+
+from pipeline.batch.batch_check import read_status
+from pipeline.batch.batch_work import judge_error
+from pipeline.core import SlipError
+from pipeline.logs import LogError
+from pipeline.recording import RecordingError
+from pipeline.store import Store, StoreError
+
+INLINE = ("--executor", "inline", "--settle", "0")
+
+
+@pytest.fixture
+def field(originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A good log and 18 texts, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    logs = tmp_path / "field"
+    logs.mkdir()
+    (logs / "a.mcap").write_bytes((originals / "a.mcap").read_bytes())
+    for number in range(18):
+        (logs / f"text{number:02}.mcap").write_text("no log " * (30 + number))
+    return logs
+
+
+@pytest.mark.parametrize("more", [(), ("--keep", "0"), ("--json",)])
+def test_old_generations_are_removed_without_logs(field: Path, more: tuple[str, ...]) -> None:
+    assert field.is_dir()
+    for rate in (20.0, 10.0):
+        (field / "run.toml").write_text(f"[velocity]\nrate_hz = {rate}\n")
+        run_slip("batch", "field/a.mcap", *INLINE)
+    code, told, error = run_slip("batch", "--prune", *more)
+    assert (code, error) == (0, "")
+    removed = 0 if not more or more == ("--json",) else 1
+    assert str(removed) in told
+    assert read_status(Store(Path("results"))).old_generations == 1 - removed
+
+
+def test_what_a_log_cannot_help_is_kept_and_what_the_machine_does_is_tried_again() -> None:
+    assert judge_error(RecordingError("no_pose", "no pose", hint="")) == ("refused", True)
+    assert judge_error(RecordingError("log_without_messages", "none", hint="")) == ("refused", True)
+    assert judge_error(LogError("not_mcap", "a text", hint="")) == ("failed", True)
+    assert judge_error(LogError("log_unreachable", "permission", hint="")) == ("failed", False)
+    assert judge_error(StoreError("disk_full", "full", hint="")) == ("failed", False)
+    assert judge_error(SlipError("other", "other", hint="")) == ("failed", False)
+
+
+def test_a_dead_log_fails_once_and_is_read_again_when_it_changes(field: Path) -> None:
+    assert run_slip("batch", "field", *INLINE)[0] == 1
+    answer = ask_verb("batch", "field", *INLINE, code=3)
+    assert (answer["failed"], answer["unchanged"]) == (18, 1)
+    assert {line["unchanged"] for line in answer["logs"]} == {True}
+    assert len(answer["errors"]) == 18
+    assert all(set(one) >= {"path", "code", "message", "hint"} for one in answer["errors"])
+    assert run_slip("batch", "field", *INLINE, "--quiet") == (3, "", "")
+    (field / "text00.mcap").write_text("no log at all " * 9)
+    code, _, error = run_slip("batch", "field", *INLINE, "--quiet")
+    assert code == 1
+    assert error.count("\n") == 1
+    assert "text00.mcap" in error
+    assert run_slip("batch", "field", *INLINE, "--force")[0] == 1
+
+
+def test_equal_reasons_are_told_once_with_the_counts_last(field: Path) -> None:
+    assert field.is_dir()
+    code, told, error = run_slip("batch", "field", *INLINE, "--quiet")
+    assert (code, told, error.count("\n")) == (1, "", 1)
+    (field / "late.mcap").write_text("no log " * 90)
+    lines = run_slip("batch", "field", *INLINE)[1].splitlines()
+    assert len(lines) < 30
+    assert lines.index("failed, as before") < lines.index("failed, new")
+    assert lines[-1].split()[0] == "quarantined"
+    assert "  and 15 more (--all lists them)" in lines
+    assert sum("text" in line for line in run_slip("batch", "field", *INLINE, "--all")[1].splitlines()) >= 18
+    status = run_slip("results", "status")[1].splitlines()
+    assert status[-1].split()[0] == "quarantined"
+    assert "  and 16 more (--all lists them)" in status
+
+
+def test_a_camera_alone_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with (tmp_path / "camera.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()  # type: ignore[no-untyped-call]
+    answer = ask_verb("batch", "camera.mcap", *INLINE, code=3)
+    assert (answer["refused"], answer["failed"], answer["errors"]) == (1, 0, [])
+    assert ask_verb("batch", "camera.mcap", *INLINE, code=3)["refused"] == 1
+    status = ask_verb("results", "status")
+    assert (status["refused"], status["runs"]) == (1, 0)
+
+
+def test_a_batch_that_found_nothing_new_leaves_its_time(field: Path) -> None:
+    store = Store(Path("results"))
+    run_slip("batch", "field", *INLINE)
+    first = read_status(store)
+    time.sleep(0.01)
+    (field / "dead.mcap").symlink_to("nothing")
+    run_slip("batch", "field", *INLINE)
+    second = read_status(store)
+    assert first.ended is not None
+    assert second.ended is not None
+    assert second.ended > first.ended
+    assert second.counts["left_out"] == 1
+    assert (first.is_idle, second.is_idle) == (False, True)
+    assert "(the last that worked on a log: " in run_slip("results", "status")[1]
+
+
+def test_a_full_disk_is_told_first_and_those_it_stopped_as_one(field: Path) -> None:
+    outcome = batch(field, Path("out"), work=work_on_full_disk)
+    errors = outcome.list_errors()
+    assert errors[0][1].code == "disk_full"
+    assert (errors[-1][1].code, errors[-1][1].what[:24]) == ("not_started", "18 logs were not started")
+    assert counts(outcome)["not_started"] == 18
+
+
+def test_results_of_a_log_that_is_gone_can_be_removed(field: Path) -> None:
+    run_slip("batch", "field/a.mcap", *INLINE)
+    (field / "a.mcap").unlink()
+    assert ask_verb("results", "status")["gone"] == 1
+    Store(Path("results")).manifests()
+    subprocess.run(["rm", "-r", "results/runs/field/a"], check=True)
+    assert ask_verb("results", "status")["gone"] == 0
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_batch_that_is_stopped_says_so(field: Path, number: int, code: int) -> None:
+    marker = field / "begun"
+    marker.mkdir()
+    environment = os.environ | {"PYTHONPATH": IMPORTABLE, "BEGUN": str(marker), "PAUSE_S": "30"}
+    started = (
+        "import batch_works, functools, pipeline.batch.batch_run as run, pipeline.cli as cli;"
+        "run.run_batch = functools.partial(run.run_batch, work=batch_works.work_slowly);"
+        "cli.main(['batch', 'field', '--executor', 'inline', '--quiet'])"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", started], env=environment, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while not any(marker.iterdir()):
+            time.sleep(0.05)
+        process.send_signal(number)
+        assert process.communicate(timeout=30)[1] == "slip: stopped; the same command continues\n"
+    assert process.returncode == code
+
+
+@pytest.mark.parametrize(
+    "words", [("batch",), ("batch", "x", "--shard", "5/4"), ("batch", "x", "--quota", "1GB")]
+)
+def test_words_that_are_not_understood_end_with_2(words: tuple[str, ...]) -> None:
+    assert run_slip(*words)[0] == 2
