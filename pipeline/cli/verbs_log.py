@@ -39,6 +39,7 @@ from pipeline.core import (
     align_rows,
     format_count,
     format_duration,
+    format_section,
     format_share,
     format_size,
     name_first,
@@ -235,7 +236,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
         gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
         lines[-1] += f"{gear}    {format_vehicle_source(seen.choice.vehicle_source)}"
         fitted = seen.choice.list_fitted()
-        lines += [f"          in run.toml: [vehicle] {'; '.join(fitted)}"] if fitted else []
+        lines += [f"          in run.toml: {format_section('vehicle', fitted)}"] if fitted else []
     lines += _format_roles(seen, everything=everything)
     notes = []
     if seen.sources is not None:

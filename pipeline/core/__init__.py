@@ -52,6 +52,7 @@ from pipeline.core.text import (
     format_length,
     format_part,
     format_recorded,
+    format_section,
     format_share,
     format_size,
     format_two,

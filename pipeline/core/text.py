@@ -174,6 +174,16 @@ def mark_finding(severity: object) -> str:
     return {"error": "!! ", "warning": "!  "}.get(str(severity), "   ")
 
 
+def format_section(section: str, lines: Iterable[str]) -> str:
+    """One line of TOML that gives keys of a section: it can be pasted as it stands.
+
+    Args:
+        section: its name.
+        lines: ``key = value`` of each.
+    """
+    return f"{section} = {{{', '.join(lines)}}}"
+
+
 def enumerate_texts(texts: Sequence[str]) -> str:
     """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
     return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))

@@ -173,7 +173,8 @@ def parse_toml(text: str) -> dict[str, object]:
     except tomllib.TOMLDecodeError as error:
         match = _LINE.search(str(error))
         line = int(match[1]) if match else text.count("\n") + 1
-        raise TomlError(f"not a valid TOML file: {' '.join(str(error).split())}", line) from None
+        why = " ".join(str(error).split())
+        raise TomlError(f"not a valid TOML file, which has one key on a line: {why}", line) from None
     except ValueError:
         raise TomlError("a number of thousands of digits") from None
     except RecursionError:

@@ -16,7 +16,17 @@ from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import PathFit, whiten_columns
 from pipeline.estimation.intervals import estimate_path
 from pipeline.estimation.run_residuals import Input
-from pipeline.models import LEAST_DELAY_S, Effect, Late, Number, find_late, find_late_effect, list_effects
+from pipeline.models import (
+    LEAST_DELAY_S,
+    STANDING,
+    Effect,
+    Largest,
+    Late,
+    Number,
+    find_late,
+    find_late_effect,
+    list_effects,
+)
 from pipeline.models import Search as HowSearched
 from pipeline.results import Delays, Detectable, Undecided, Unobservable
 from pipeline.run import MotionRun
@@ -43,12 +53,22 @@ def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]
         same = effect.same_in_one_motion if largest.is_one_motion else ()
         # Whichever fits the transients better: what a drive does at another speed is not known.
         same += effect.same_at_one_speed if largest.is_one_speed else ()
-        alike = [one for one in dict.fromkeys(same) if one in candidates and one not in outcome.final.ids]
+        alike = [
+            one
+            for one in dict.fromkeys(same)
+            if one in candidates and one not in outcome.final.ids and _is_asked(candidates[one](), largest)
+        ]
         names = [*dict.fromkeys([*rivals, *alike])]
         if names:
             numbers = {name: _read_numbers(outcome.final, name)}
             numbers |= {other: _read_numbers(fit, other) for other, fit in rivals.items()}
             yield Undecided((name, *names), numbers)
+
+
+def _is_asked(effect: Effect, largest: Largest) -> bool:
+    """Whether a run asks for the motion that an effect limits: the speed or the turning."""
+    asked = {"speed": largest.speed, "turn": largest.turn}
+    return all(asked.get(p.relative_to, math.inf) > STANDING for p in effect.parameters)
 
 
 def _read_numbers(fit: PathFit, name: str) -> dict[str, Number]:

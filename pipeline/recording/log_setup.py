@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from pipeline.core import SlipError
+from pipeline.core import SlipError, format_section
 from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
 from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.findings import Finding, Severity, blame_damage
@@ -182,10 +182,11 @@ def _suggest_pose(index: LogIndex) -> str:
         if plain_type(index.types[topic]).partition("/")[0] not in _KNOWN_PACKAGES
     }
     lines = [
-        "{} looks like a pose, of a type that is not known; to use it, in run.toml: [pose] {}".format(
+        "{} looks like a pose, of a type that is not known; to use it, in run.toml: {}".format(
             topic,
-            "; ".join(
-                f'{key} = "{topic}.{path}"' for key, path in zip(("x", "y", "yaw"), three, strict=True)
+            format_section(
+                "pose",
+                [f'{key} = "{topic}.{path}"' for key, path in zip(("x", "y", "yaw"), three, strict=True)],
             ),
         )
         for topic, three in sorted(by_topic.items())
@@ -270,11 +271,12 @@ _COMMANDED = re.compile(COMMANDED.pattern + "|pwm|duty|throttle")
 _SPEED = re.compile(r"^(speed|velocity|linear(_velocity|_speed|_x)?|forward(_speed)?|v|vx|v_x|throttle)$")
 _TURN = re.compile(r"^(yaw_?rate|turn_?rate|omega|angular(_velocity|_speed|_z)?|turn|w|wz|w_z)$")
 _STEER = re.compile(r"^(steering(_angle)?|steer|delta)$")
-_UNITS: Mapping[str, str] = {
-    "tick|count|enc": '; unit = "ticks"; per_turn = 1000 (ticks of a whole turn)',
-    "rpm": '; unit = "rpm"',
+_UNITS: Mapping[str, tuple[tuple[str, ...], str]] = {
+    "tick|count|enc": (('unit = "ticks"', "per_turn = 1000"), " (ticks of a whole turn)"),
+    "rpm": (('unit = "rpm"',), ""),
 }
 _ANY_UNIT = ' (the motion shows their unit; unit = "rad/s", "m/s", "rpm" or "rad" gives it)'
+_AXES = {"speed_topic": 1, "yaw_rate_topic": 0}
 _WHEELS = {2: "two", 4: "four", 6: "six"}
 """Numbers of wheels of a vehicle that turns by the speeds of its sides."""
 _SEVERAL = (
@@ -320,10 +322,11 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
             continue
         role = "command" if COMMANDED.search(topic.lower()) else "wheels"
         left, right = (_quote(f"{topic}.{field}[{number}]") for number in range(len(SIDES)))
+        line = format_section(role, [f"left_topic = {left}", f"right_topic = {right}"])
         what = (
-            f"{topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they "
-            f"are {'the left and right wheels' if count == len(SIDES) else _SEVERAL}, in run.toml: [{role}] "
-            f"left_topic = {left}; right_topic = {right}{_ANY_UNIT}"
+            f"{topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they are "
+            f"{'the left and right wheels' if count == len(SIDES) else _SEVERAL}, in run.toml: "
+            f"{line}{_ANY_UNIT}"
         )
         severity: Severity = "info" if getattr(sources, role) else "warning"
         findings.append(Finding("numbers_not_used", severity, topic, {"what": what}))
@@ -378,11 +381,13 @@ def _find_only_sides(index: LogIndex, sources: Sources) -> _Sides | None:
 
 def _offer(sides: _Sides) -> Finding:
     """The line that takes numbers for a role."""
-    unit = next((text for word, text in _UNITS.items() if re.search(word, sides.left.lower())), _ANY_UNIT)
+    unit, about = next(
+        (of for word, of in _UNITS.items() if re.search(word, sides.left.lower())), ((), _ANY_UNIT)
+    )
+    topics = (f"left_topic = {_quote(sides.left)}", f"right_topic = {_quote(sides.right)}")
     what = (
         f"{sides.left} and {sides.right}, whose meaning is not known; if they are the left and "
-        f"right wheels, in run.toml: [{sides.role}] left_topic = {_quote(sides.left)}; "
-        f"right_topic = {_quote(sides.right)}{unit}"
+        f"right wheels, in run.toml: {format_section(sides.role, (*topics, *unit))}{about}"
     )
     return Finding("numbers_not_used", "warning", sides.topic, {"what": what})
 
@@ -404,10 +409,10 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         if MEASURED.search(topic.lower()):
             continue
         if plain_type(index.types[topic]) == JOYSTICK:
+            axes = [f"{key} = {_quote(f'{topic}.axes[{one}]')}" for key, one in _AXES.items()]
             what = (
                 f"{topic} (a joystick); if two of its axes are the command, in run.toml: "
-                f"[command] speed_topic = {_quote(f'{topic}.axes[1]')}; "
-                f"yaw_rate_topic = {_quote(f'{topic}.axes[0]')} (which axes, the set-up of its driver says)"
+                f"{format_section('command', axes)} (which axes, the set-up of its driver says)"
             )
             yield Finding("numbers_not_used", "warning", topic, {"what": what})
             continue
@@ -420,6 +425,6 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
             speed, turn = (_quote(f"{topic}.{path}") for path in (speeds[0], turn))
             what = (
                 f"{topic} (a speed and a turn), whose meaning is not known; if it is the command, "
-                f"in run.toml: [command] speed_topic = {speed}; {key} = {turn}"
+                f"in run.toml: {format_section('command', [f'speed_topic = {speed}', f'{key} = {turn}'])}"
             )
             yield Finding("numbers_not_used", "warning", topic, {"what": what})

@@ -379,7 +379,7 @@ class _Chooser:
     def _pose_of_fields(self, section: PoseSection) -> PoseSource:
         """The pose of three fields of a topic."""
         given = {"x": section.x, "y": section.y, "yaw": section.yaw}
-        example = '[pose] x = "/topic.x", y = "/topic.y", yaw = "/topic.yaw"'
+        example = 'pose = {x = "/topic.x", y = "/topic.y", yaw = "/topic.yaw"}'
         if absent := [name for name, text in given.items() if not text]:
             what = f"a pose of fields needs x, y and yaw, and pose.{absent[0]} is not given"
             raise self._bad(what, f"Give all three: {example}.", "field_needed")

@@ -792,8 +792,8 @@ def _vehicle_of_folder(of: Values) -> str:
         who = f"{logs[0]} and {len(logs) - 1} more of its folder with the same topics are"
     return (
         "the end of the recording is lost, and it does not name its vehicle: it is taken to be a "
-        f"{of['vehicle']}, as {who}; another: --vehicle, or in run.toml: [vehicle] preset = "
-        f'"{of["preset"]}"'
+        f"{of['vehicle']}, as {who}; another: --vehicle, or in run.toml: "
+        f'vehicle = {{preset = "{of["preset"]}"}}'
     )
 
 

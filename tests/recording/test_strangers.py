@@ -1,6 +1,7 @@
 """Logs of strangers: what is not the vehicle's is told from what is, nothing is left out in silence."""
 
 import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -281,7 +282,7 @@ def record_own(robot: Robot, topic: str, kind: str, fields: Mapping[str, Floats]
         ("/base.rpm_fl", "/base.rpm_fr", 'unit = "rpm"'),
         ("/base.motorL_speed", "/base.motorR_speed", "the motion shows their unit"),
         ("/lwheel.data", "/rwheel.data", "the motion shows their unit"),
-        ("/left_encoder.data", "/right_encoder.data", 'unit = "ticks"; per_turn'),
+        ("/left_encoder.data", "/right_encoder.data", 'unit = "ticks", per_turn = 1000}'),
     ],
 )
 def test_sides_are_known_by_any_of_their_usual_names(
@@ -298,8 +299,11 @@ def test_sides_are_known_by_any_of_their_usual_names(
         own = {name.partition(".")[2]: values for name, values in fields.items()}
         topics = [record_own(robot, "/base", "own.Base", own)]
     said = told(set_up(tmp_path, robot.command(), *topics, robot.pose()))
-    assert f'[wheels] left_topic = "{left}"; right_topic = "{right}"' in said
     assert unit in said
+    (line,) = re.findall(r"in run.toml: (wheels = {.*?})", said)
+    # A line that is offered can be pasted as it stands.
+    offered = tomllib.loads(line)["wheels"]
+    assert {"left_topic": left, "right_topic": right}.items() <= offered.items()
 
 
 def test_a_command_of_an_own_type_and_a_joystick_are_offered(tmp_path: Path) -> None:
@@ -309,7 +313,7 @@ def test_a_command_of_an_own_type_and_a_joystick_are_offered(tmp_path: Path) -> 
     axes = np.column_stack([robot.asked.turn, robot.asked.speed])
     joystick = record_cdr(robot.asked, "/joy", "sensor_msgs/msg/Joy", {"axes": axes}, "float32[] axes")
     said = told(set_up(tmp_path, command, joystick, robot.base(), robot.pose()))
-    assert '[command] speed_topic = "/drive.speed"; yaw_rate_topic = "/drive.turn_rate"' in said
+    assert 'command = {speed_topic = "/drive.speed", yaw_rate_topic = "/drive.turn_rate"}' in said
     assert "/joy (a joystick)" in said
 
 
