@@ -60,6 +60,23 @@ def test_one_circle_does_not_tell_a_droop_from_a_limit(tmp_path: Path) -> None:
     assert any({"body_turn_limit", "difference_gain"} <= set(item.candidates) for item in found.undecided)
 
 
+@pytest.mark.parametrize(
+    ("program", "limit", "also", "never"),
+    [
+        ("straight", "wheel_speed_limit", "body_speed_limit", "body_turn_limit"),
+        ("spins", "body_turn_limit", "wheel_speed_limit", "body_speed_limit"),
+    ],
+)
+def test_one_motion_does_not_tell_a_limit_of_the_body_from_one_of_its_wheels(
+    program: str, limit: str, also: str, never: str, tmp_path: Path
+) -> None:
+    value = 4.0 if limit == "wheel_speed_limit" else 0.7
+    found = _drive(program, {limit: {"limit": value}}, tmp_path)
+    (group,) = found.undecided
+    assert {limit, also} <= set(group.candidates)
+    assert never not in group.candidates
+
+
 @pytest.mark.long
 def test_a_change_of_ground_on_a_straight_is_a_change_of_speed(tmp_path: Path) -> None:
     found = _drive("straight", {"terrain_change": {"k_v": 0.8, "k_w": 0.75}}, tmp_path)
