@@ -188,9 +188,9 @@ def examine(given: Given) -> Recording:
 
 def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
     """What contradicts a reading of a log: findings, and scales that no such vehicle has."""
-    found = {(one.id, one.where) for one in recording.findings if one.severity != "info"}
+    doubts = {(one.id, one.where) for one in recording.findings if one.severity != "info"}
     if recording.refused is not None:
-        found.add((recording.refused.id, recording.refused.where))
+        doubts.add((recording.refused.id, recording.refused.where))
     radius = given.vehicle.wheel_radius_m
     radii = (radius / _ALIKE, radius * _ALIKE) if given.is_known else RADII_M
     ranges = {"gyro": [(1.0 / _ALIKE, _ALIKE)]}
@@ -198,8 +198,8 @@ def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
         scale = one.turned if one.role == "gyro" else one.ahead
         usual = ranges.get(one.role, [(1.0 / _ALIKE, _ALIKE), radii])
         if scale and not any(low <= scale <= high for low, high in usual):
-            found.add(("scale", one.name))
-    return found
+            doubts.add(("scale", one.name))
+    return doubts
 
 
 def _examine(given: Given) -> Recording:
