@@ -555,7 +555,7 @@ class Facts:
                 lines.append("; ".join(missing) or effect.id)
         clocks = {str(row.get("run")): row.get("pose_delay_s") for row in self.file.list_fitted("runs")}
         lines += [
-            f"clock_offset.d = {late:.3g} s: the poses of {quote_name(run)} are late"
+            f"clock_offset.d = {late:.3g} s: the heading of the poses of {quote_name(run)} is late"
             for run, late in clocks.items()
             if isinstance(late, float) and abs(late) >= LEAST_DELAY_S
         ]

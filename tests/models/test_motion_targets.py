@@ -206,7 +206,7 @@ def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be(
     late = {**FIT, "runs": [{**run, "pose_delay_s": 0.42}]}  # type: ignore[misc]
     text = export_model(make(find_effect("effective_track")(k=1.8), fit=late), "ros2_control")
     _, _, rest = text.partition("Not covered by these parameters:")
-    assert "clock_offset.d = 0.42 s: the poses of 'yard/monday' are late" in rest
+    assert "clock_offset.d = 0.42 s: the heading of the poses of 'yard/monday' is late" in rest
 
 
 def test_a_parameter_that_no_effect_tells_is_named_as_one_that_is_not_written() -> None:
