@@ -383,8 +383,9 @@ class Model:
         ]
         numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
         texts = {"effect": pl.String, "sentence": pl.String}
-        last = {"same_as": pl.List(pl.String), "refusal": pl.String}
-        return pl.DataFrame(rows, schema={**texts, **numbers, **last})
+        return pl.DataFrame(
+            rows, schema={**texts, **numbers, "same_as": pl.List(pl.String), "refusal": pl.String}
+        )
 
     def view(
         self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None

@@ -608,10 +608,7 @@ class Facts:
         if math.isfinite(number.low):
             single = len(self.file.list_fitted("runs")) == 1
             text += f" ({'this run' if single else 'these runs'}, 95 %: {number.low:.5g} to {number.high:.5g}"
-            if parameter.between_runs is not None and not is_of_one_run(effect.parameters):
-                there = expect_another_run(parameter, number)
-                text += f"; another run: {there.low:.3g} to {there.high:.3g}"
-            text += ")"
+            text += f"; {number.elsewhere})" if number.elsewhere else ")"
         if by_ground := self._list_by_ground(label):
             text += f", the mean of {', '.join(by_ground)}"
         if number.doubt == UNDECIDED:

@@ -487,14 +487,16 @@ def _format_causes(effect: Named) -> Iterator[str]:
 
 
 def _format_range(effect: Named) -> Iterator[str]:
-    """The expected range of values in another run on this ground, where it is known."""
-    ends = [
-        f"{name} {value.another_run.low:.3g} to {value.another_run.high:.3g}{suffix_unit(value.unit)}"
-        for name, value in effect.parameters.items()
-        if math.isfinite(value.another_run.low)
-    ]
-    if ends:
-        yield f"expected range between runs: {effect.id} {', '.join(ends)}"
+    """The expected range of values in another run on this ground, where it is known: measured or assumed."""
+    for is_measured in (True, False):
+        ends = [
+            f"{name} {value.another_run.low:.3g} to {value.another_run.high:.3g}{suffix_unit(value.unit)}"
+            for name, value in effect.parameters.items()
+            if math.isfinite(value.another_run.low) and value.is_spread_measured == is_measured
+        ]
+        if ends:
+            kind = "expected" if is_measured else "assumed"
+            yield f"{kind} range between runs: {effect.id} {', '.join(ends)}"
 
 
 def _format_encoders(run: RunDiagnosis) -> str:

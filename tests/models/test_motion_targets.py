@@ -15,7 +15,7 @@ from verbs import run_verb
 from pipeline import export
 from pipeline.export import Facts, export_model, list_targets
 from pipeline.export.spread import find_response
-from pipeline.models import Effect, find_effect
+from pipeline.models import Effect, find_effect, format_model, list_effects
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
 
@@ -211,6 +211,25 @@ def test_an_interval_says_of_which_run_it_is_and_what_another_one_would_show() -
     assert low < ends["effective_track.k"][0] < ends["effective_track.k"][1] < high
     several = {**FIT, "runs": [*FIT["runs"], *FIT["runs"]]}  # type: ignore[misc]
     assert "(these runs, 95 %" in export_model(make(track, fit=several, intervals=ends), "ros2_control")
+
+
+def test_an_expected_range_that_is_assumed_is_said_to_be() -> None:
+    kinds = {kind.id: kind for kind in list_effects()}
+    for name, said in {"effective_track": "", "body_turn_limit": ", assumed"}.items():
+        effect = kinds[name](**{p.name: p.typical for p in kinds[name].parameters})
+        (parameter,) = effect.parameters
+        assert (parameter.between_runs is None) == bool(said)
+        value = effect.values[parameter.name]
+        ends = {f"{name}.{parameter.name}": (0.98 * value, 1.02 * value)}
+        file = make(effect, fit=FIT, intervals=ends)
+        expected = file.find_number(effect, parameter).elsewhere
+        assert re.fullmatch(rf"another run: [\d.]+ to [\d.]+{said}", expected)
+        assert f"# {expected}" in format_model(file)
+        assert f"; {expected})" in export_model(file, "nav2" if said else "ros2_control")
+        (told,) = json.loads(export_model(file, "json"))["effects"]
+        number = told["parameters"][parameter.name]
+        assert number["is_spread_measured"] == (not said)
+        assert number["another_run"]["low"] < 0.98 * value < 1.02 * value < number["another_run"]["high"]
 
 
 def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be() -> None:
