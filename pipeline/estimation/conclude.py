@@ -260,7 +260,7 @@ def of_run(
         findings=(
             *common.findings,
             *note_brevity(data, common),
-            *(_relate(one, effects, delays) for one in recording.list_findings()),
+            *(relate_delay(one, effects, delays) for one in recording.list_findings()),
         ),
         timing=delays,
         when=tuple(one for one in common.when if one.run == number),
@@ -269,22 +269,22 @@ def of_run(
     )
 
 
-def _relate(finding: Finding, named: Sequence[Named], delays: Delays) -> Finding:
+def relate_delay(finding: Finding, named: Sequence[Named], delays: Delays) -> Finding:
     """A finding of the recording with what the diagnosis says of the same delay.
 
     The gyro tells the delay of the heading alone. What an effect of the drive does at a change of the command
     is no dead time, unless a dead time is named, too.
     """
     kinds = [find_effect(one.id) for one in named]
-    found: dict[str, object] = {}
+    values: dict[str, object] = {}
     if finding.id == "pose_delay" and any(one.late is Late.POSES for one in kinds):
         heading, position = delays.yaw_delay_s, delays.pose_delay_s
         if heading is not None and position is not None and abs(position - heading) >= LEAST_DELAY_S:
-            found = {"position_s": position}
+            values = {"position_s": position}
     elif finding.id == "command_delay" and all(one.late is not Late.COMMANDS for one in kinds):
         slow = [one.id for one in kinds if one.place <= Place.DRIVE and Excitation.CHANGES in one.needs]
-        found = {"explained_by": slow} if slow else {}
-    return replace(finding, values={**finding.values, **found})
+        values = {"explained_by": slow} if slow else {}
+    return replace(finding, values={**finding.values, **values})
 
 
 def _note_not_followed(results: Sequence[PathResult]) -> list[Finding]:
