@@ -15,8 +15,8 @@ from pipeline.api.model_changes import carry_models, change_model, export_file, 
 from pipeline.core import INPUT_WORDS, finite_or_none, number_in, objects_in
 from pipeline.datasets import ModelFit
 from pipeline.estimation import EstimationData, ModelState
-from pipeline.estimation.additions import Tries
-from pipeline.estimation.ladder import find_share_removed
+from pipeline.estimation.additions import Tries, find_refused
+from pipeline.estimation.ladder import find_share_removed, judge_whole
 from pipeline.estimation.largest import measure_asked
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.estimation.stored_diagnosis import find_diagnosis
@@ -327,7 +327,12 @@ class Model:
         return slip.select("t", *names).with_columns(made).with_columns(pl.col("^model_.$").fill_nan(None))
 
     def missing(
-        self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
+        self,
+        run: StoredRun,
+        *,
+        refused: bool = False,
+        input: Source | None = None,
+        vehicle_of: Owner | None = None,
     ) -> pl.DataFrame:
         """What it lacks to describe a run: the effects that help, the most helpful first.
 
@@ -337,6 +342,8 @@ class Model:
 
         Args:
             run: an analyzed run.
+            refused: list in their place those that would help as much, and that `slip model add` refuses
+                because this run holds too little evidence for them.
             input: what it is fed with; None as at the last fit, else as the effects need it.
             vehicle_of: whose geometry counts where the run is of another vehicle.
 
@@ -344,8 +351,8 @@ class Model:
             A row an effect: ``effect``, its id, that of the formula is ``suggested_term``; ``sentence``, what
             the vehicle does by it; ``t_mrmse_m`` [m] and ``r_mrmse_rad`` [rad], the errors over 2 s with it;
             ``t_removed`` and ``r_removed``, the shares of the errors without it that it removes, below zero
-            where one grows; ``same_as``, ids of effects that this run does not tell from it. No row where
-            nothing helps.
+            where one grows; ``same_as``, ids of effects that this run does not tell from it; ``refusal``,
+            why it is refused, empty for what helps. No row where nothing helps.
 
         Raises:
             SlipError: the run has no such input, is too short, or is of another vehicle.
@@ -353,9 +360,14 @@ class Model:
         data, state = self._prepare(run, input, vehicle_of)
         model = replace(self.file.model, vehicle=data.vehicle, effects=state.effects_of(0))
         with threadpool_limits(1):
-            tries = Tries(data, model, run.list_diagnosed(data.vehicle))
-            helping = tries.fold([one for one in tries.try_each() if one is not None])
-        without = to_json(tries.before)
+            if refused:
+                before = judge_whole(data, model)
+                listed, errors_before = find_refused(before), before.errors
+            else:
+                tries = Tries(data, model, run.list_diagnosed(data.vehicle))
+                listed = tries.fold([one for one in tries.try_each() if one is not None])
+                errors_before = tries.before
+        without = to_json(errors_before)
         asked = measure_asked(data.runs, data.vehicle)
         rows = [
             {
@@ -364,13 +376,16 @@ class Model:
                 **{name: errors[name] for name in _OVER_2S},
                 **{f"{name[0]}_removed": _find_removed(errors, without, name) for name in _OVER_2S},
                 "same_as": list(one.twins),
+                "refusal": one.refusal,
             }
-            for one in helping
+            for one in listed
             for errors in [to_json(one.errors)]
         ]
         numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
         texts = {"effect": pl.String, "sentence": pl.String}
-        return pl.DataFrame(rows, schema={**texts, **numbers, "same_as": pl.List(pl.String)})
+        return pl.DataFrame(
+            rows, schema={**texts, **numbers, "same_as": pl.List(pl.String), "refusal": pl.String}
+        )
 
     def view(
         self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None

@@ -90,10 +90,8 @@ def change_model(
     fitted, rest = gathered[: len(runs)], gathered[len(runs) :]
     prior = None if fleet is None else Store(fleet)
     fit = datasets.fit_to_runs(before, after, fitted, source, first_s=first_s, fleet=prior)
-    terrains, own = [run.terrain for run in fitted], fit.file.per_run
-    carried = (
-        carry_over(fit.file.model, rest, fit.chosen.source, fitted_on=terrains, per_run=own) if rest else []
-    )
+    rows, own = fit.file.list_fitted("runs"), fit.file.per_run
+    carried = carry_over(fit.file.model, rest, fit.chosen.source, fitted_on=rows, per_run=own) if rest else []
     return Change(fit, carried)
 
 
@@ -153,8 +151,8 @@ def carry_models(
         own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in read}
         seen = "its error there is not a held-out error"
         warnings += [f"{name} was fitted to {run}: {seen}" for run in sorted(own)]
-        terrains = [str(run.get("terrain")) for run in file.list_fitted("runs")]
-        carried = carry_over(file.model, read, chosen.source, fitted_on=terrains, per_run=file.per_run)
+        fitted_on = file.list_fitted("runs")
+        carried = carry_over(file.model, read, chosen.source, fitted_on=fitted_on, per_run=file.per_run)
         rows += [(name, item) for item in carried]
     return Carried(chosen, rows, [*filter(None, (*warnings, *(item.warning for _, item in rows)))])
 
@@ -279,5 +277,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
         "own_fit": to_json(item.own.pooled),
         "ideal": to_json(item.ideal.pooled),
         "ratio": item.ratio,
+        "ratios": dict(item.apart),
+        "beyond_fit": dict(item.beyond),
         "warning": item.warning,
     }

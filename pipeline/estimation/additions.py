@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.decision import judge
-from pipeline.estimation.ladder import LadderStep, judge_whole
+from pipeline.estimation.decision import SHOWN, find_expected_fall, judge
+from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors
 from pipeline.estimation.matrix import Matrix
-from pipeline.models import Model, explain_idle
+from pipeline.estimation.plausibility import is_nameable
+from pipeline.models import Model, explain_idle, find_effect
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from pipeline.core import Floats
-    from pipeline.estimation.candidates import Candidate
     from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.model_fit import Fitted
     from pipeline.models import Conditions, Effect, Parameter
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 MOST_FITTED = 6
 """Candidates of drivetrain and of ground that are fitted: the gain of others does not justify a fit."""
+_MOST_REFUSED = 3
+"""The same of those that may be refused."""
 _TWIN = 0.95
 """Cosine between the residual changes of two effects above which they are twins: they share nine tenths of
 the squared change."""
@@ -108,19 +111,62 @@ def _explain_values(effect: Effect, conditions: Conditions) -> str:
     return f"with these values {as_what}"
 
 
-def list_promising(data: EstimationData, fitted: Fitted) -> list[Candidate]:
-    """Effects whose expected gain exceeds the price of their parameters, per path the largest gain first."""
-    candidates = data.list_candidates(data.source)
-    by_id = {candidate.id: candidate for candidate in candidates}
-    promising = []
+def list_promising(data: EstimationData, fitted: Fitted) -> list[str]:
+    """Ids of effects whose expected gain exceeds their price, per path the largest gain first."""
+    return [
+        matrix.trials[one.added[0]].effect.id
+        for matrix in _list_matrices(data, fitted)
+        for one in [one for one in matrix.list_singles() if matrix.expect_change(one) < 0.0][:MOST_FITTED]
+    ]
+
+
+def find_refused(before: LadderStep) -> list[Addition]:
+    """Effects that would lower an error of a model as much as one must, and lack the evidence for a name.
+
+    Values that no vehicle has explain nothing: such effects are left out.
+
+    Args:
+        before: the model, fitted.
+
+    Returns:
+        With the reason against each; what leaves least first.
+    """
+    fitted, refused = before.fitted, list[Addition]()
+    for fit, matrix in zip(fitted.fits, _list_matrices(fitted.data, fitted), strict=True):
+        for move in matrix.list_singles()[:_MOST_REFUSED]:
+            added = matrix.list_states(move)[0]
+            there = replace(fit, state=added, residual=fit.path.find_residuals(added))
+            if find_expected_fall(there, fit.residual - there.residual) < SHOWN:
+                continue
+            name = matrix.trials[move.added[0]].effect.id
+            with suppress(MotionError, ArithmeticError, ValueError):
+                after = judge_whole(fitted.data, fitted.model + find_effect(name)())
+                falls = 1.0 - np.array(after.errors.ratios(before.errors)[-2:])
+                if not lowers_errors(before.errors, after.errors) or np.nanmax(falls) < SHOWN:
+                    continue
+                refused += _list_unproven(before, after, name)
+    return sorted(refused, key=lambda one: one.remaining)
+
+
+def _list_unproven(before: LadderStep, after: LadderStep, name: str) -> Iterator[Addition]:
+    """An effect of a model as an addition to that without it, where nothing but evidence is wanting."""
+    data = after.fitted.data
+    for fit in after.fitted.fits:
+        effect = fit.state.find(name)
+        if effect is None or not fit.path.owns(effect) or not is_nameable(effect, data.conditions):
+            continue
+        judged = judge(fit, effect, Matrix(fit, (), data.largest), data.conditions)
+        if judged.refusal and not judged.is_proven:
+            remaining = _measure_remaining(before.errors, after.errors)
+            yield Addition(effect, after.errors, remaining, judged.refusal)
+
+
+def _list_matrices(data: EstimationData, fitted: Fitted) -> Iterator[Matrix]:
+    """Of each path, what effects beside those of a model would explain."""
+    ids = fitted.model.ids
+    effects = [one for one in data.list_candidates(data.source) if one.id not in ids and one().acts_in(ids)]
     for path, fit in zip(data.paths, fitted.fits, strict=True):
-        ids = fitted.model.ids
-        effects = [one for one in candidates if one.id not in ids and one().acts_in(ids)]
-        mine = [candidate for candidate in effects if path.owns(candidate())]
-        matrix = Matrix(fit, mine, data.largest)
-        paying = [one for one in matrix.list_singles() if matrix.expect_change(one) < 0.0]
-        promising += [by_id[matrix.trials[one.added[0]].effect.id] for one in paying[:MOST_FITTED]]
-    return promising
+        yield Matrix(fit, [one for one in effects if path.owns(one())], data.largest)
 
 
 class Tries:
@@ -139,7 +185,7 @@ class Tries:
         self.before = self._base.errors
         first = list_beyond(data, model, known)
         ids = {one.id for one in first}
-        promising = [candidate() for candidate in list_promising(data, self._base.fitted)]
+        promising = [find_effect(name)() for name in list_promising(data, self._base.fitted)]
         self.candidates = [*first, *(one for one in promising if one.id not in ids)]
 
     def try_each(self) -> Iterator[Addition | None]:

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from pipeline.estimation import unexplained as residual_structure
+from pipeline.estimation.additions import find_refused
 from pipeline.estimation.ambiguity import (
     Clocks,
     join_classes,
@@ -36,28 +37,36 @@ from pipeline.estimation.largest import measure_asked
 from pipeline.estimation.plausibility import measure_moves, note_unusual
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import (
+    LEAST_DELAY_S,
     UNDECIDED,
     Effect,
+    Excitation,
     Late,
     Model,
     ModelFile,
     Number,
+    Place,
     find_effect,
     find_late_effect,
     format_model,
 )
 from pipeline.recording import Finding
 from pipeline.results import (
+    ABOVE_FLOOR,
+    CHANGE,
+    SEARCH_CUT,
     Delays,
     Detectable,
     Named,
     PathLadder,
+    Refused,
     Region,
     RunDiagnosis,
     Step,
     Undecided,
     Unexplained,
     Unobservable,
+    measure_excess,
 )
 from pipeline.run import MotionError
 
@@ -189,6 +198,13 @@ def summarize(
         ),
         need=measure_need(named, widths),
     )
+    cut = {SEARCH_CUT, CHANGE}.intersection(one.id for one in common.findings)
+    is_open = measure_excess(common) >= ABOVE_FLOOR and not cut and not common.has_suggestion
+    if assessment is not None and is_open:
+        refused = find_refused(assessment.whole)
+        common = replace(
+            common, refused=tuple(Refused(one.effect.id, one.refusal, one.errors) for one in refused)
+        )
     estimates = tuple(number for one in assessments.values() for number in list_estimates(data, one, named))
     fitted = assessment.fitted if assessment else None
     return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
@@ -241,12 +257,34 @@ def of_run(
         common,
         run=recording.name,
         effects=effects,
-        findings=(*common.findings, *note_brevity(data, common), *recording.list_findings()),
+        findings=(
+            *common.findings,
+            *note_brevity(data, common),
+            *(relate_delay(one, effects, delays) for one in recording.list_findings()),
+        ),
         timing=delays,
         when=tuple(one for one in common.when if one.run == number),
         commanded_turn=measure_commanded_turn(data.runs[number], data.vehicle),
         asked=measure_asked(data.runs[number : number + 1], data.vehicle),
     )
+
+
+def relate_delay(finding: Finding, named: Sequence[Named], delays: Delays) -> Finding:
+    """A finding of the recording with what the diagnosis says of the same delay.
+
+    The gyro tells the delay of the heading alone. What an effect of the drive does at a change of the command
+    is no dead time, unless a dead time is named, too.
+    """
+    kinds = [find_effect(one.id) for one in named]
+    values: dict[str, object] = {}
+    if finding.id == "pose_delay" and any(one.late is Late.POSES for one in kinds):
+        heading, position = delays.yaw_delay_s, delays.pose_delay_s
+        if heading is not None and position is not None and abs(position - heading) >= LEAST_DELAY_S:
+            values = {"position_s": position}
+    elif finding.id == "command_delay" and all(one.late is not Late.COMMANDS for one in kinds):
+        slow = [one.id for one in kinds if one.place <= Place.DRIVE and Excitation.CHANGES in one.needs]
+        values = {"explained_by": slow} if slow else {}
+    return replace(finding, values={**finding.values, **values})
 
 
 def _note_not_followed(results: Sequence[PathResult]) -> list[Finding]:

@@ -648,7 +648,7 @@ def judge(
     own = list_costs(path, fit.noise, base.residual) - list_costs(path, fit.noise, fit.residual)
     evidence = np.asarray(np.bincount(path.unit, own), dtype=np.float64)
     t, change = measure_t(fit, effect, base), base.residual - fit.residual
-    felt = _find_expected_fall(fit, change)
+    felt = find_expected_fall(fit, change)
     refusal, is_proven, acting = "", False, _list_acting(fit, effect)
     if t < least_t:
         refusal = f"it is not significant: t = {t:.1f}, required {least_t:.2g}"
@@ -664,8 +664,8 @@ def judge(
         refusal = "its 95 % interval includes no effect"
     elif frequency < _SURE:
         refusal = (
-            f"it pays for its numbers in {format_share(frequency)} of resampled recordings, "
-            f"required {format_share(_SURE)}"
+            f"it shows in too few stretches of the drive ({format_share(frequency)} of resampled recordings, "
+            f"{format_share(_SURE)} required)"
         )
     elif not gain > 0.0:
         refusal = "the error on data that it was not fitted to does not fall"
@@ -735,7 +735,7 @@ def _drop_effect(fit: PathFit, name: str, residual: Floats) -> tuple[PathFit, bo
     return fit_roughly(min(starts, key=lambda one: one.score), _STEPS), False
 
 
-def _find_expected_fall(fit: PathFit, change: Floats) -> float:
+def find_expected_fall(fit: PathFit, change: Floats) -> float:
     """The largest relative fall of an error that is expected of an effect by the motion it makes.
 
     What a run's own errors happen to be beside it is chance, above all over few long stretches.

@@ -97,7 +97,8 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Number]:
         spread = run.alignment.latency_spread_s
         half = NORMAL_95 * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
     number = Number(value, value - half - run.repeats_s, value + half, parameter.unit)
-    return {parameter.name: replace_fields(number, another_run=expect_another_run(parameter, number))}
+    there, is_measured = expect_another_run(parameter, number), parameter.between_runs is not None
+    return {parameter.name: replace_fields(number, another_run=there, is_spread_measured=is_measured)}
 
 
 def list_estimates(

@@ -290,7 +290,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
                 **driven,
             }
             for run_residuals, timing, driven in zip(
-                data.residuals_by_run, assessment.fitted.state.timing, _measure_driven(data), strict=True
+                data.residuals_by_run, assessment.fitted.state.timing, measure_driven(data), strict=True
             )
         ],
         "ladder": [
@@ -325,7 +325,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     return replace(file, model=model, per_run=per_run, numbers=others | assessment.numbers, fit=fit)
 
 
-def _measure_driven(data: EstimationData) -> list[dict[str, float]]:
+def measure_driven(data: EstimationData) -> list[dict[str, float]]:
     """Driven speed and yaw rate of each run over windows of half a second: the 99th percentile.
 
     Of the speed also the lower quartile of the windows in which it drives.

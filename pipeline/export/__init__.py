@@ -13,6 +13,7 @@ import operator
 import pkgutil
 import re
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -294,12 +295,14 @@ class Amount:
         sources: a line for each parameter it was computed from; empty if nothing is known.
         effects: ids of the effects among them.
         is_doubtful: whether one of the parameters is in doubt.
+        undefined: ids of the effects that no single value describes; empty where one does.
     """
 
     value: float
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
     is_doubtful: bool = False
+    undefined: frozenset[str] = frozenset()
 
     def __neg__(self) -> Amount:
         return self.change(operator.neg)
@@ -355,6 +358,11 @@ class Setting:
     is_doubtful: bool = False
 
 
+def _name_plainly(path: str) -> str:
+    """A parameter without its node and ROS's group."""
+    return ".".join(part for part in path.split(".")[1:] if part != "ros__parameters") or path
+
+
 @dataclass
 class ParameterTable:
     """Parameters of a target, in order.
@@ -363,18 +371,22 @@ class ParameterTable:
         head: comment lines above them.
         settings: the parameters.
         unknown: names of the parameters that no effect of the model tells.
+        undefined: the same of those that no single value describes, with what keeps it from that.
     """
 
     head: list[str] = field(default_factory=list)
     settings: list[Setting] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    undefined: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def add(self, path: str, amount: Amount, note: str = "") -> None:
         """Add a value; of an unknown one only that it is."""
         if amount.is_known:
             self._append(path, _round(amount.value), amount, note)
+        elif amount.undefined:
+            self.undefined[_name_plainly(path)] = amount.undefined
         else:
-            self._miss(path)
+            self.unknown.append(_name_plainly(path))
 
     def add_row(self, path: str, amounts: tuple[Amount | float, ...], note: str = "") -> None:
         """Add a parameter of several values; if one that is no constant is unknown, only that it is."""
@@ -383,12 +395,7 @@ class ParameterTable:
             numbers = tuple(_round(a.value if isinstance(a, Amount) else a) for a in amounts)
             self._append(path, numbers, combine(lambda *_: math.nan, *measured), note)
         else:
-            self._miss(path)
-
-    def _miss(self, path: str) -> None:
-        self.unknown.append(
-            ".".join(part for part in path.split(".")[1:] if part != "ros__parameters") or path
-        )
+            self.unknown.append(_name_plainly(path))
 
     def _append(self, path: str, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
         require_plausible(path, *(value if isinstance(value, tuple) else (value,)))
@@ -490,9 +497,17 @@ class Facts:
         return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.SPEED_LAG))
 
     def find_turn_delay(self) -> Amount:
-        """Delay of the yaw rate behind a smooth command [s]; on a car it comes from the steering."""
-        lag = Quantity.STEERING_LAG if self.vehicle.kind == "ackermann" else Quantity.TURN_LAG
-        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
+        """Delay of the yaw rate behind a smooth command [s]; on a car it comes from the steering.
+
+        Where an effect delays the speed by a time constant and the yaw rate otherwise, as motors do of which
+        those of both sides work against each other in a turn, no single delay describes that.
+        """
+        is_car = self.vehicle.kind == "ackermann"
+        delay = self.take(Quantity.STEERING_LAG if is_car else Quantity.TURN_LAG)
+        uneven = frozenset() if is_car else self.take(Quantity.SPEED_LAG).effects - delay.effects
+        if uneven:
+            return Amount(math.nan, undefined=uneven)
+        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), delay)
 
     def find_speed_limit(self) -> Amount:
         """Largest speed of the body [m/s], from its command or from the wheels when driving straight.
@@ -555,7 +570,7 @@ class Facts:
                 lines.append("; ".join(missing) or effect.id)
         clocks = {str(row.get("run")): row.get("pose_delay_s") for row in self.file.list_fitted("runs")}
         lines += [
-            f"clock_offset.d = {late:.3g} s: the poses of {quote_name(run)} are late"
+            f"clock_offset.d = {late:.3g} s: the heading of the poses of {quote_name(run)} is late"
             for run, late in clocks.items()
             if isinstance(late, float) and abs(late) >= LEAST_DELAY_S
         ]
@@ -593,10 +608,7 @@ class Facts:
         if math.isfinite(number.low):
             single = len(self.file.list_fitted("runs")) == 1
             text += f" ({'this run' if single else 'these runs'}, 95 %: {number.low:.5g} to {number.high:.5g}"
-            if parameter.between_runs is not None and not is_of_one_run(effect.parameters):
-                there = expect_another_run(parameter, number)
-                text += f"; another run: {there.low:.3g} to {there.high:.3g}"
-            text += ")"
+            text += f"; {number.elsewhere})" if number.elsewhere else ")"
         if by_ground := self._list_by_ground(label):
             text += f", the mean of {', '.join(by_ground)}"
         if number.doubt == UNDECIDED:
@@ -653,6 +665,8 @@ def list_comments(facts: Facts, table: ParameterTable) -> list[str]:
     lines += [f"  {line}" for line in unmapped]
     lines += ["Not written, as no effect of the model determines it:"] if unknown else []
     lines += [f"  {line}" for line in textwrap.wrap(unknown, _LINE)]
+    for name, effects in table.undefined.items():
+        lines.append(f"Not written, as a single value does not describe {', '.join(sorted(effects))}: {name}")
     return [make_plain(line) for line in lines]
 
 
@@ -665,17 +679,29 @@ def write_yaml(facts: Facts, table: ParameterTable) -> str:
         for node in above:
             group = group.setdefault(node, {})
         group[name] = setting
-    comments = [f"# {line}" for line in list_comments(facts, table)]
-    return "".join(f"{line}\n" for line in [*comments, *_list_lines(tree)])
+    said = Counter(line for one in table.settings for line in one.sources)
+    shared = {line: name for line, count in said.items() if count > 1 and (name := _shorten(line)) != line}
+    head = list_comments(facts, table)
+    head += (
+        ["Named beside several parameters:", *(f"  {make_plain(line)}" for line in shared)] if shared else []
+    )
+    return "".join(f"{line}\n" for line in [*(f"# {line}" for line in head), *_list_lines(tree, shared)])
 
 
-def _list_lines(group: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+def _shorten(line: str) -> str:
+    """The name of a source: what stands before its value or its explanation."""
+    return re.split(" = |: ", line, maxsplit=1)[0]
+
+
+def _list_lines(group: Mapping[str, Any], shared: Mapping[str, str], indent: str = "") -> Iterator[str]:
     for name, item in group.items():
         if isinstance(item, Setting):
-            yield from (f"{indent}# {make_plain(line)}" for line in item.sources)
+            names = ", ".join(dict.fromkeys(shared[line] for line in item.sources if line in shared))
+            lines = [*([names] if names else []), *(line for line in item.sources if line not in shared)]
+            yield from (f"{indent}# {make_plain(line)}" for line in lines)
             yield f"{indent}{'# ' * item.is_doubtful}{name}: {_write_value(item.value)}"
         else:
-            lines = list(_list_lines(item, f"{indent}  "))
+            lines = list(_list_lines(item, shared, f"{indent}  "))
             # A group without values is no group for those who read it.
             is_empty = all(line.lstrip().startswith("#") for line in lines)
             yield f"{indent}{'# ' * is_empty}{name}:"

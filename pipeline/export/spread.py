@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.core import Floats
+from pipeline.core import Flags, Floats
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Facts
-from pipeline.models import Effect, Place, predict_step
+from pipeline.models import Effect, Place, Quantity, predict_step
 from pipeline.sources import Vehicle
 
 _SPEEDS = 4
@@ -21,6 +21,8 @@ _USUAL_TOP = (1.0, 0.5)
 """Speed [m/s] and yaw rate [rad/s] if neither the fit nor the vehicle gives the largest ones."""
 _SAME = 0.01
 """Spread of a factor over the speeds that one value still fits: the tolerance of data sheets."""
+_LIMITS = frozenset({Quantity.SPEED_LIMIT, Quantity.TURN_LIMIT, Quantity.WHEEL_SPEED_LIMIT})
+"""Quantities of effects that clip a command."""
 
 
 def find_steady_motion(
@@ -47,12 +49,14 @@ class Response(NamedTuple):
         linear: speed over its command when driving straight, shape (n,).
         angular: yaw rate over its command at these speeds, shape (n,).
         turn: the commanded yaw rate [rad/s].
+        is_clipped: whether a limit changes the motion at these speeds: it is no multiplier there, shape (n,).
     """
 
     speeds: Floats
     linear: Floats
     angular: Floats
     turn: float
+    is_clipped: Flags
 
     @property
     def separation(self) -> Floats:
@@ -71,28 +75,49 @@ def find_response(facts: Facts) -> Response:
     top, turn = (max(facts.list_driven(key), default=0.0) for key in (DRIVEN_SPEED, DRIVEN_TURN))
     top, turn = top or vehicle.max_speed_mps or _USUAL_TOP[0], 0.5 * (turn or _USUAL_TOP[1])
     speeds = [float(f"{top * (n + 1) / _SPEEDS:.3g}") for n in range(_SPEEDS)]
-    straight = [find_steady_motion(vehicle, effects, speed, 0.0)[0] for speed in speeds]
-    curved = [find_steady_motion(vehicle, effects, speed, turn)[1] for speed in speeds]
-    return Response(np.array(speeds), np.array(straight) / speeds, np.array(curved) / turn, turn)
+    free = [
+        one for one in effects if not _LIMITS.intersection(q for p in one.parameters for q in p.quantities)
+    ]
+
+    def drive(acting: Sequence[Effect]) -> tuple[Floats, Floats]:
+        straight = [find_steady_motion(vehicle, acting, speed, 0.0)[0] for speed in speeds]
+        curved = [find_steady_motion(vehicle, acting, speed, turn)[1] for speed in speeds]
+        return np.array(straight) / speeds, np.array(curved) / turn
+
+    linear, angular = drive(effects)
+    unlimited = (linear, angular) if len(free) == len(effects) else drive(free)
+    same = [
+        np.isclose(own, other, rtol=_SAME, atol=0.0)
+        for own, other in zip((linear, angular), unlimited, strict=True)
+    ]
+    return Response(np.array(speeds), linear, angular, turn, ~(same[0] & same[1]))
 
 
 def describe_spread(facts: Facts) -> list[str]:
     """Multipliers per speed as lines of a comment, where one for all speeds does not fit; else empty."""
     response = find_response(facts)
+    free = ~response.is_clipped
     own = facts.vehicle.controller_track_multiplier
     rows = {
         "wheel_separation_multiplier": own * response.separation,
         "wheel_radius_multiplier": response.linear,
     }
     lines = []
-    for name, values in rows.items():
-        if np.isfinite(values).all() and float(np.ptp(values)) > _SAME * float(np.abs(values).mean()):
+    for name, every in rows.items():
+        values = every[free]
+        if (
+            values.size
+            and np.isfinite(values).all()
+            and float(np.ptp(values)) > _SAME * float(np.abs(values).mean())
+        ):
             at = ", ".join(
                 f"{value:.3f} at {speed:g} m/s"
-                for value, speed in zip(values.tolist(), response.speeds.tolist(), strict=True)
+                for value, speed in zip(values.tolist(), response.speeds[free].tolist(), strict=True)
             )
             lines.append(f"One {name} does not fit all speeds: {at}.")
     if lines:
+        clipped = ", ".join(f"{speed:g} m/s" for speed in response.speeds[~free].tolist())
+        lines += [f"Without {clipped}, where a limit clips the wheels in that turn."] if clipped else []
         at = f"at a yaw rate of {response.turn:.3g} rad/s"
         lines.append(
             f"These are of all effects together, {at}; each value below is of the effects beside it."

@@ -14,8 +14,8 @@ from pipeline.models.catalogue import find_effect, refuse_taken
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
-from pipeline.models.number import DOUBTS, UNDECIDED, Number
-from pipeline.models.parameter import Parameter
+from pipeline.models.number import DOUBTS, UNDECIDED, Number, expect_another_run
+from pipeline.models.parameter import Parameter, is_of_one_run
 from pipeline.run import MotionError
 from pipeline.sources import (
     ConfigurationError,
@@ -101,7 +101,12 @@ class ModelFile:
             # Nobody fitted it, or each run has its own.
             ends = value, value
         number = replace(noted, low=ends[0], high=ends[1]).doubt_as(parameter)
-        return replace(number, low=noted.low, high=noted.high)
+        number = replace(number, low=noted.low, high=noted.high)
+        if number.at_bound or is_of_one_run(effect.parameters):
+            return number
+        is_measured = parameter.between_runs is not None
+        there = expect_another_run(parameter, number)
+        return replace(number, another_run=there, is_spread_measured=is_measured)
 
     def list_numbers(self) -> dict[str, Number]:
         """All numbers of the model by label ``effect.name``; see `find_number`."""

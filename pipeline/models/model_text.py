@@ -125,8 +125,9 @@ def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | No
         parts.append("per_run = true")
     parts += [f"doubt = {format_value(noted.doubt)}"] * bool(noted.doubt)
     parts += [f"stretches = {noted.stretches}"] * bool(noted.stretches)
-    reason = "" if file is None else file.find_number(effect.rounded, parameter).reason
-    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}" + (f"  # {reason}" if reason else "")
+    number = None if file is None else file.find_number(effect.rounded, parameter)
+    remark = "" if number is None else "; ".join(filter(None, (number.reason, number.elsewhere)))
+    return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}" + (f"  # {remark}" if remark else "")
 
 
 def _format_table(name: str, table: Mapping[str, object]) -> list[str]:

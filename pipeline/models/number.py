@@ -96,6 +96,15 @@ class Number(msgspec.Struct, frozen=True):
         return DOUBTS[self.doubt][1].format(self.stretches) if self.doubt else ""
 
     @property
+    def elsewhere(self) -> str:
+        """What to expect of it in another run, and whether that is assumed; empty where it is not known."""
+        there = self.another_run
+        if not math.isfinite(there.high - there.low):
+            return ""
+        text = f"another run: {there.low:.3g} to {there.high:.3g}"
+        return text if self.is_spread_measured else f"{text}, assumed"
+
+    @property
     def is_undetermined(self) -> bool:
         """Whether the runs do not determine it: no finite interval, one limit only, or at its bound."""
         return self.at_bound or self.doubt == ONE_LIMIT or not math.isfinite(self.high - self.low)

@@ -62,6 +62,7 @@ else:
                 "Named",
                 "Narrowing",
                 "PathLadder",
+                "Refused",
                 "Region",
                 "RunDiagnosis",
                 "Share",

@@ -330,6 +330,20 @@ class Unexplained(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     with_formula: Errors | None = None
 
 
+class Refused(msgspec.Struct, frozen=True, rename={"id": "effect"}):
+    """An effect that would remove much of what a model leaves, and that lacks the evidence for a name.
+
+    Attributes:
+        id: of the effect.
+        reason: against its name, as a clause.
+        errors: held-out errors of the model with it.
+    """
+
+    id: str
+    reason: str
+    errors: Errors
+
+
 class Delays(msgspec.Struct, frozen=True):
     """Delays of a run [s], and the source of its heading: `gyro` or `pose`."""
 
@@ -467,6 +481,8 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
         undecided: alternatives that fit equally well.
         unobservable_why: effects not observable in this log.
         detectable: detection limits of the other effects that were not identified.
+        refused: effects that would remove much of what a model leaves that is far above the noise floor, and
+            that lack the evidence for a name; what leaves least first.
         unexplained: residual structure without a known cause; None without.
         findings: of the stages and of the diagnosis.
         ladder: steps with their held-out errors.
@@ -494,6 +510,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     undecided: tuple[Undecided, ...] = ()
     unobservable_why: dict[str, Unobservable] = {}
     detectable: tuple[Detectable, ...] = ()
+    refused: tuple[Refused, ...] = ()
     unexplained: Unexplained | None = None
     findings: tuple[Finding, ...] = ()
     ladder: tuple[Step, ...] = ()

@@ -229,7 +229,13 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
         for before, after in pairwise(run.ladder)
         for name in list_added(before, after)
     }
-    return falls | {one.id: "corrected before the fit" for one in run.effects if one.corrected}
+    return falls | {one.id: _describe_correction(one, run) for one in run.effects if one.corrected}
+
+
+def _describe_correction(effect: Named, run: RunDiagnosis) -> str:
+    """Which clock was corrected: that of the position may be another than that of the heading."""
+    moved = any(one.id == "pose_delay" and "position_s" in one.values for one in run.findings)
+    return "of the position" if is_clock(effect) and moved else "corrected before the fit"
 
 
 def format_short(effect: Named) -> str:
@@ -374,7 +380,7 @@ def _format_effect(
     """The motion due to an effect, then its id with values, error reductions and qualifications."""
     yield describe_motion(effect, run)
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
-    notes += ["corrected before the fit"] if effect.corrected else []
+    notes += [_describe_correction(effect, run)] if effect.corrected else []
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
     shared = _list_shared(effect)
     yield from _describe_numbers(effect.id, shared, parts, _format_values(effect, shared), width)
@@ -481,14 +487,16 @@ def _format_causes(effect: Named) -> Iterator[str]:
 
 
 def _format_range(effect: Named) -> Iterator[str]:
-    """The expected range of values in another run on this ground, where it is known."""
-    ends = [
-        f"{name} {value.another_run.low:.3g} to {value.another_run.high:.3g}{suffix_unit(value.unit)}"
-        for name, value in effect.parameters.items()
-        if math.isfinite(value.another_run.low)
-    ]
-    if ends:
-        yield f"expected range between runs: {effect.id} {', '.join(ends)}"
+    """The expected range of values in another run on this ground, where it is known: measured or assumed."""
+    for is_measured in (True, False):
+        ends = [
+            f"{name} {value.another_run.low:.3g} to {value.another_run.high:.3g}{suffix_unit(value.unit)}"
+            for name, value in effect.parameters.items()
+            if math.isfinite(value.another_run.low) and value.is_spread_measured == is_measured
+        ]
+        if ends:
+            kind = "expected" if is_measured else "assumed"
+            yield f"{kind} range between runs: {effect.id} {', '.join(ends)}"
 
 
 def _format_encoders(run: RunDiagnosis) -> str:

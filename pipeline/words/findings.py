@@ -221,8 +221,14 @@ def _bad_stretch(of: Values) -> str:
 
 
 def _pose_delay(of: Values) -> str:
-    order = "late" if of["value"] > 0.0 else "early"
-    return f"the poses are {abs(of['value']):.2g} s {order} against the gyro: corrected"
+    if "position_s" in of:
+        heading, position = map(_format_late, (of["value"], of["position_s"]))
+        return f"the heading of the poses is {heading} against the gyro, their position {position} by the fit"
+    return f"the poses are {_format_late(of['value'])} against the gyro: corrected"
+
+
+def _format_late(value: float) -> str:
+    return f"{abs(value):.2g} s {'late' if value > 0.0 else 'early'}"
 
 
 def _short_segments(of: Values) -> str:
@@ -1131,7 +1137,15 @@ def _commands_in_bursts(of: Values) -> str:
 
 
 def _command_delay(of: Values) -> str:
-    late = of["value"]
+    from pipeline.models import name_term  # noqa: PLC0415 - heavy
+
+    late, explained = of["value"], of.get("explained_by")
+    if explained:
+        causes = enumerate_texts(list(map(name_term, explained)))
+        return (
+            f"{_FOLLOWED[of['followed']]} seem to follow {of['source']} {late:.2f} s after its stamps, then "
+            f"with a lag of {of['lag_s']:.2f} s: the diagnosis explains both by {causes}, without a dead time"
+        )
     return (
         f"{_FOLLOWED[of['followed']]} begin to follow {of['source']} {late:.2f} s after its stamps, then "
         f"with a lag of {of['lag_s']:.2f} s: the drive answers so late, or the stamps are early; no other "

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 
 from pipeline.core import enumerate_texts, format_share
+from pipeline.models import name_term
 from pipeline.recording import Finding
 from pipeline.results import (
     ABOVE_FLOOR,
@@ -98,7 +99,7 @@ def _list_open_ends(run: RunDiagnosis) -> tuple[str, str, str]:
     elif SEARCH_CUT in noted:
         why = "the budget ended the search for effects early"
     elif CHANGE not in noted and measure_excess(run) >= ABOVE_FLOOR:
-        why = _UNKNOWN
+        why = describe_refused(run) or _UNKNOWN
     change = noted.get(CHANGE)
     return _describe_choice(run), "" if change is None else format_finding(change), why
 
@@ -123,7 +124,15 @@ def _format_nothing(run: RunDiagnosis) -> list[str]:
             *sentences,
             f"The cause is {name_group(run.undecided[0].candidates)}, which this log does not separate",
         ]
-    return [*sentences, f"No known effect explains the error{_suggest(run)}"]
+    return [*sentences, describe_refused(run) or f"No known effect explains the error{_suggest(run)}"]
+
+
+def describe_refused(run: RunDiagnosis) -> str:
+    """What the refused effect that leaves least would leave, and why it has no name; empty without one."""
+    if not run.refused:
+        return ""
+    one = run.refused[0]
+    return f"{name_term(one.id)} would leave {format_step(one.errors)}, but {one.reason}"
 
 
 def _suggest(run: RunDiagnosis) -> str:

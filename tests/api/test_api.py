@@ -282,6 +282,11 @@ def test_a_model_ranks_what_it_lacks(run: slip.Run) -> None:
     assert ranked["effect"][0] == EFFECT
     one = ranked.row(0, named=True)
     assert one["sentence"].startswith("Effective track 0.99 m (nominal 0.55)")
+    assert set(ranked["refusal"]) == {""}
+    refused = ideal.missing(run, input="command", refused=True)
+    assert refused.schema == ranked.schema
+    assert all(refused["refusal"])
+    assert EFFECT not in refused["effect"].to_list()
     with_it = (ideal + EFFECT).fit(run, input="command")
     assert one["t_mrmse_m"] == pytest.approx(with_it.errors["t_mrmse_m"], rel=1e-3)
     without = ideal.fit(run, input="command").errors["r_mrmse_rad"]

@@ -102,7 +102,7 @@ def test_a_model_of_one_asphalt_predicts_another_but_not_ice(recordings: Recordi
     ]
     data = EstimationData([run], vehicle, M)
     fitted = fit_model(data, Model(vehicle, (find_effect(TRACK)(), find_effect(INERTIA)())))
-    asphalt, ice = carry_over(fitted.model, others, M, fitted_on=["asphalt"])
+    asphalt, ice = carry_over(fitted.model, others, M, fitted_on=[{"terrain": "asphalt"}])
     assert asphalt.ratio <= 1.1
     assert asphalt.warning == ""
     assert ice.ratio > 1.1

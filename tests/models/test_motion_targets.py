@@ -15,7 +15,7 @@ from verbs import run_verb
 from pipeline import export
 from pipeline.export import Facts, export_model, list_targets
 from pipeline.export.spread import find_response
-from pipeline.models import find_effect
+from pipeline.models import Effect, find_effect, format_model, list_effects
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
 
@@ -185,6 +185,18 @@ def test_a_multiplier_is_told_by_speed_where_one_does_not_fit() -> None:
     assert f"of all effects together, at a yaw rate of {response.turn:.3g} rad/s" in several
 
 
+def test_no_multiplier_is_told_of_a_speed_at_which_a_limit_clips_the_wheels() -> None:
+    track, limit = find_effect("effective_track")(k=1.8), find_effect("wheel_speed_limit")(limit=4.0)
+    response = find_response(Facts(make(track, limit)))
+    assert 0 < response.is_clipped.sum() < response.speeds.size
+    # What is left of the speeds is one track.
+    assert "does not fit" not in export_model(make(track, limit), "ros2_control")
+    text = export_model(make(*SLIPPING, limit), "ros2_control")
+    (line,) = (one for one in text.splitlines() if "where a limit clips the wheels in that turn" in one)
+    clipped = [f"{speed:g} m/s" for speed in response.speeds[response.is_clipped].tolist()]
+    assert line == f"# Without {', '.join(clipped)}, where a limit clips the wheels in that turn."
+
+
 def test_an_interval_says_of_which_run_it_is_and_what_another_one_would_show() -> None:
     ends = {"effective_track.k": (1.79, 1.82)}
     track = find_effect("effective_track")(k=1.8)
@@ -201,19 +213,60 @@ def test_an_interval_says_of_which_run_it_is_and_what_another_one_would_show() -
     assert "(these runs, 95 %" in export_model(make(track, fit=several, intervals=ends), "ros2_control")
 
 
+def test_an_expected_range_that_is_assumed_is_said_to_be() -> None:
+    kinds = {kind.id: kind for kind in list_effects()}
+    for name, said in {"effective_track": "", "body_turn_limit": ", assumed"}.items():
+        effect = kinds[name](**{p.name: p.typical for p in kinds[name].parameters})
+        (parameter,) = effect.parameters
+        assert (parameter.between_runs is None) == bool(said)
+        value = effect.values[parameter.name]
+        ends = {f"{name}.{parameter.name}": (0.98 * value, 1.02 * value)}
+        file = make(effect, fit=FIT, intervals=ends)
+        expected = file.find_number(effect, parameter).elsewhere
+        assert re.fullmatch(rf"another run: [\d.]+ to [\d.]+{said}", expected)
+        assert f"# {expected}" in format_model(file)
+        assert f"; {expected})" in export_model(file, "nav2" if said else "ros2_control")
+        (told,) = json.loads(export_model(file, "json"))["effects"]
+        number = told["parameters"][parameter.name]
+        assert number["is_spread_measured"] == (not said)
+        assert number["another_run"]["low"] < 0.98 * value < 1.02 * value < number["another_run"]["high"]
+
+
 def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be() -> None:
     (run,) = FIT["runs"]  # type: ignore[misc]
     late = {**FIT, "runs": [{**run, "pose_delay_s": 0.42}]}  # type: ignore[misc]
     text = export_model(make(find_effect("effective_track")(k=1.8), fit=late), "ros2_control")
     _, _, rest = text.partition("Not covered by these parameters:")
-    assert "clock_offset.d = 0.42 s: the poses of 'yard/monday' are late" in rest
+    assert "clock_offset.d = 0.42 s: the heading of the poses of 'yard/monday' is late" in rest
 
 
 def test_a_parameter_that_no_effect_tells_is_named_as_one_that_is_not_written() -> None:
-    text = export_model(make(find_effect("wheel_servo")(tau=0.3)), "nav2")
+    text = export_model(make(find_effect("drive_lag")(tau=0.3)), "nav2")
     _, _, unknown = text.partition("Not written, as no effect of the model determines it:")
-    assert "FollowPath.model_delay_wz" in unknown.partition("controller_server:")[0]
-    assert "model_delay_wz" not in unknown.partition("controller_server:")[2]
+    assert "FollowPath.vx_max" in unknown.partition("controller_server:")[0]
+    assert "vx_max" not in unknown.partition("controller_server:")[2]
+
+
+@pytest.mark.parametrize("beside", [(), (find_effect("transport_delay")(d=0.1),)])
+def test_a_delay_that_is_no_single_one_is_said_to_be_none(beside: tuple[Effect, ...]) -> None:
+    text = export_model(make(find_effect("wheel_servo")(tau=0.3), *beside), "nav2")
+    head, _, rest = text.partition("controller_server:")
+    assert "a single value does not describe wheel_servo: FollowPath.model_delay_wz" in head
+    assert "model_delay_vx: " in rest
+    assert "model_delay_wz" not in rest
+
+
+def test_what_several_parameters_come_from_is_said_once() -> None:
+    ends = {"body_speed_limit.limit": (0.89, 0.91), "body_turn_limit.limit": (1.09, 1.11)}
+    limits = [find_effect("body_speed_limit")(limit=0.9), find_effect("body_turn_limit")(limit=1.1)]
+    file = make(*limits, fit=FIT, intervals=ends)
+    text = export_model(file, "nav2")
+    sources = [line for line in text.splitlines() if " = " in line or "no more than was driven: " in line]
+    assert len(sources) == len(set(sources)) > 1
+    values = [
+        line for line in text.splitlines() if line.lstrip().startswith(("vx_m", "wz_m", "max_", "min_"))
+    ]
+    assert len(values) > len(sources)
 
 
 @pytest.mark.parametrize(

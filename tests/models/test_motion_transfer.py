@@ -8,9 +8,10 @@ from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.estimation import EstimationData, Input, carry_over, fit_model
 from pipeline.estimation.run_residuals import RunResiduals
-from pipeline.export import export_model
+from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.simulate import VEHICLES, Disturbance, Program
+from pipeline.words.models import format_transfers
 
 HUSKY = vehicle_of("husky_a200")
 TILE = {"effective_track": 1.8, "icr_offset": 0.12}
@@ -21,12 +22,31 @@ def test_a_model_carries_over_to_the_same_ground_and_warns_on_ice() -> None:
     ice = simulate({"effective_track": 1.4, "body_inertia": 0.9}, seed=3)
     data = EstimationData([first], HUSKY, Input.MEASURED)
     fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in (*TILE, "body_inertia"))))
-    same, other = carry_over(fitted.model, [second, ice], Input.MEASURED, fitted_on=["tile"])
+    same, other = carry_over(fitted.model, [second, ice], Input.MEASURED, fitted_on=[{"terrain": "tile"}])
     assert 0.95 < same.ratio <= 1.1
     assert same.warning == ""
     assert other.ratio > 1.3
     assert "fitted on tile" in other.warning
     assert same.carried.pooled.t_mrmse_m < same.ideal.pooled.t_mrmse_m
+
+
+def test_what_fails_and_faster_driving_than_in_the_fit_are_told_apart() -> None:
+    first, wider = simulate(TILE, seed=1), simulate({**TILE, "effective_track": 1.5}, seed=2)
+    data = EstimationData([first], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in TILE)))
+    rows = [{"terrain": "tile", DRIVEN_SPEED: 1.0, DRIVEN_TURN: 0.1}]
+    (item,) = carry_over(fitted.model, [wider], Input.MEASURED, fitted_on=rows)
+    assert set(item.apart) == {"position", "heading"}
+    assert item.apart["heading"] > 1.1
+    assert [*item.beyond] == ["yaw rate"]
+    assert item.beyond["yaw rate"] > 2.0
+    said = f"driven at up to {item.beyond['yaw rate']:.2g} times the largest yaw rate of the fit"
+    assert said in item.warning
+    lines = format_transfers([("tile.toml", item)])
+    assert f"  {said}" in lines
+    assert any(f"{item.apart['heading']:.2f} in heading" in line for line in lines)
+    # The heading alone, where the position is as good as with a fit to the run.
+    assert ("in heading alone" in item.warning) == (item.apart["position"] <= 1.1)
 
 
 def typical_model(kind: str) -> Model:

@@ -13,7 +13,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Number, find_effect, list_effects
-from pipeline.results import Errors, Named, RunDiagnosis, Unexplained, read_result
+from pipeline.results import Errors, Named, Refused, RunDiagnosis, Unexplained, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main
 from pipeline.sources import list_presets
 from pipeline.sources.one_vehicle import load_vehicle
@@ -53,6 +53,21 @@ def test_every_effect_reads_well_in_a_verdict() -> None:
         assert _NUMBER.search(clause)
         assert len(clause) < 80
         assert re.search(r"\. (The robot [a-z]+s |The [a-z]+ )", verdict)
+
+
+def test_a_verdict_names_the_effect_that_evidence_is_wanting_for() -> None:
+    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.4, 0.3)])
+    why = "it shows in too few stretches of the drive (52 % of resampled recordings, 85 % required)"
+    refused = (
+        Refused("steering_offset", why, Errors(t_mrmse_m=0.09, r_mrmse_rad=0.02)),
+        Refused("steering_gain", why, Errors(t_mrmse_m=0.2, r_mrmse_rad=0.1)),
+    )
+    for one, before in ((drawn, "remain"), (replace(drawn, ladder=drawn.ladder[:1]), "off")):
+        verdict = format_verdict(replace(one, refused=refused))
+        assert before in verdict
+        assert verdict.endswith(f" Steering offset would leave 9 cm and 1.1 degrees, but {why}.")
+        assert "No known effect" not in verdict
+        assert "No known effect" in format_verdict(one)
 
 
 def test_a_verdict_says_what_a_suggested_term_would_leave() -> None:
