@@ -29,7 +29,7 @@ from pipeline.core import (
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, has_no_pose, key_finding, read_findings, read_result
-from pipeline.words.diagnosis import list_lines
+from pipeline.words.diagnosis import DEAD_ENCODERS, list_lines
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -208,7 +208,9 @@ def _format_head(summary: Summary) -> list[str]:
     state = "log complete" if not losses else "log with losses"
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
     # The verdict states an error without the mark of a finding.
-    errors = count_serious(read_findings(summary)).get("error")
+    findings = read_findings(summary)
+    state += ", a dead encoder" * any(one.id in DEAD_ENCODERS for one in findings)
+    errors = count_serious(findings).get("error")
     state += f", {errors}" if errors else ""
     if gaps:
         count, longest = cast("int", gaps[0]["count"]), number_in(gaps[0], "value")

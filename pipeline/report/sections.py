@@ -45,6 +45,7 @@ from pipeline.results import (
     split_main,
 )
 from pipeline.words import (
+    DEAD_ENCODERS,
     Cell,
     Column,
     Table,
@@ -267,6 +268,9 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     losses = objects_in(log, "losses")
     complete = log.get("complete") is not False and not losses
     strip = [("good", "log complete") if complete else ("error", f"log has losses ({max(len(losses), 1)})")]
+    findings = list_findings(report)
+    if any(one.id in DEAD_ENCODERS for one in findings):
+        strip.append(("error", "a dead encoder"))
     if report.summary.get("simulated"):
         strip.append(("note", "simulated"))
     if log.get("unchecked"):
@@ -275,7 +279,6 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     if segments is not None:
         gaps = int(segments) - 1
         strip.append(("good", "no gaps") if gaps <= 0 else ("note", f"{int(segments):,} segments"))
-    findings = list_findings(report)
     repeated = next((one.value for one in findings if one.id == "held_poses"), None)
     if repeated is not None:
         strip.append(("note", f"{format_known_share(repeated)} of the poses repeated"))

@@ -258,7 +258,8 @@ def format_short(effect: Named) -> str:
                 None,
                 (
                     format_numbers({name: value}),
-                    _NOT_KNOWN * (not value.doubt and is_open(effect.id, name, value)),
+                    _NOT_KNOWN
+                    * (not value.doubt and not effect.corrected and is_open(effect.id, name, value)),
                     describe_number(effect.id, name) * is_said,
                 ),
             )
