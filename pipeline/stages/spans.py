@@ -559,16 +559,20 @@ def _compare_wheels(rims: Rims, blocks: _Blocks, poses: pl.DataFrame) -> list[Sp
     driven = np.zeros((rims.times.size, 3)) if rims.driven is None else rims.driven
     known = blocks.hold_all(np.isfinite(driven))
     source, asked = blocks.average(np.nan_to_num(driven)), blocks.average(rims.asked)
-    fit = _fit(blocks, source, blocks.average(rims.moved), known, is_command=False)
+    moved = blocks.average(rims.moved)
+    fit = _fit(blocks, source, moved, known, is_command=False)
     spans = list[Span]()
     for one in _list_contradictions(blocks, fit, source) if fit is not None else ():
         kind: Kind | None = None
+        part = slice(*np.searchsorted(blocks.start, (one.start, one.end)))
         if not one.is_driven:
-            part = slice(*np.searchsorted(blocks.start, (one.start, one.end)))
             # Wheels that are locked under a command slide.
             kind = None if np.abs(asked[part]).sum(axis=1).mean() > LIVE_SHARE * rims.top else "pushed"
         elif one.motion == "stands":
             kind = "localization_frozen" if _is_frozen(poses, one.start, one.end) else "stuck"
+            brought, made = (np.abs(at[part].sum(axis=0)).sum() for at in (moved, source))
+            # Wheels that spin bring less, and yet the body goes or turns somewhere.
+            kind = None if kind == "stuck" and brought > LIVE_SHARE * made else kind
         elif one.motion != "shorter":
             # Wheels that spin bring less, which is no fault of the poses.
             kind = "rotated" if one.motion == "turned" else "lost"
