@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, field
 
 from pipeline.analysis import Options
-from pipeline.core import SlipError, UsageError, shorten
+from pipeline.core import SlipError, shorten
 
 
 class BatchError(SlipError):
@@ -115,12 +115,12 @@ def parse_shard(text: str) -> Shard:
     """The shard ``i/n``, i from 1 to n.
 
     Raises:
-        UsageError: ``bad_shard``.
+        SlipError: ``bad_shard``.
     """
     match = _SHARD.fullmatch(text)
     number, count = (int(match[1]), int(match[2])) if match else (0, 0)
     if not 1 <= number <= count:
-        raise UsageError(
+        raise SlipError(
             "bad_shard", f"{text!r} is not a shard", hint="Write i/n with i from 1 to n, for example 2/4"
         )
     return Shard(number=number, count=count)

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from pipeline.batch import Request, Shard
+from pipeline.batch import BatchError, Request, Shard
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
@@ -153,10 +153,14 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     """
     skipped: list[Skipped] = []
     began = round(time.time(), 3)
+    is_refused = False
     try:
         return _run(request, watch, work, skipped)
+    except BatchError:
+        is_refused = True
+        raise
     finally:
-        if request.targets:
+        if request.targets and not is_refused:
             _note_end(Store(request.options.out), began, skipped)
 
 

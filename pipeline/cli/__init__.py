@@ -38,7 +38,6 @@ from pipeline.cli.conventions import (
 )
 from pipeline.core import (
     SlipError,
-    UsageError,
     guess_names,
     keep_current_folder_out,
     limit_memory,
@@ -211,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SlipError as error:
         print_error(error)
         _refuse_json(words, error)
-        sys.exit(USAGE if isinstance(error, UsageError) else FAILED)
+        sys.exit(FAILED)
     except BrokenPipeError:
         # The reader of the pipe has exited (`slip ... | head`): no output is possible.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

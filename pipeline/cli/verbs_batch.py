@@ -41,7 +41,7 @@ from pipeline.cli.conventions import (
     print_note,
     summarize_error,
 )
-from pipeline.core import SlipError, UsageError, measure_memory, name_state
+from pipeline.core import SlipError, measure_memory, name_state
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Outcome
@@ -103,9 +103,9 @@ def batch(  # noqa: D417 - the shared choices document themselves
 
     if not logs and not prune:
         hint = "Give logs: slip batch LOGS, a folder or a glob"
-        raise UsageError("no_logs", "no log is given", hint=hint)
+        raise SlipError("no_logs", "no log is given", hint=hint)
     if quota is not None and not prune:
-        raise UsageError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
+        raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
     if not logs:

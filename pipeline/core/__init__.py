@@ -38,7 +38,6 @@ from pipeline.core.text import (
     NORMAL_95,
     FigureFormat,
     SlipError,
-    UsageError,
     align_rows,
     count_places,
     enumerate_texts,

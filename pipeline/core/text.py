@@ -53,10 +53,6 @@ class SlipError(Exception):
         return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
 
 
-class UsageError(SlipError):
-    """Words of a command that are not understood: exit code 2, as of an option that there is not."""
-
-
 def shorten(text: str, most: int = _READABLE) -> str:
     """A text; of a long one the first ``most`` characters, and how many it has."""
     return text if len(text) <= most else f"{text[:most]}... (cut, of {len(text):,} characters)"

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pipeline.recording.clocks import *
     from pipeline.recording.drive import *
     from pipeline.recording.echo import *
-    from pipeline.recording.evidence import *
     from pipeline.recording.examination import *
     from pipeline.recording.extract import *
     from pipeline.recording.findings import *
@@ -38,7 +37,6 @@ else:
             "clocks": ("find_pauses",),
             "drive": ("SIGNALS", "interpolate_readings"),
             "echo": ("check_echo",),
-            "evidence": ("RADII_M",),
             "examination": ("Recording", "examine"),
             "extract": ("Extracted", "Extraction", "Given", "extract_tables"),
             "findings": ("SURE", "Finding", "Severity", "StageError", "blame_damage"),

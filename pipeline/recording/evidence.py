@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.core import Complex, Floats, join_parts
 from pipeline.recording.motion import CLEAR, LEAST_NATS, Motion, compare, fit
 from pipeline.recording.readings import Reading, fit_across
-from pipeline.sources import COMMANDED, LENGTH_UNITS, MEASURED, convert_unit
+from pipeline.sources import COMMANDED, LENGTH_UNITS, MEASURED, RADII_M, convert_unit
 
 # Frame of the pose.
 
@@ -401,8 +401,6 @@ _UNUSUAL = 4.0
 """Surprise of counts that no unit explains, as ticks of an encoder are [nats]."""
 _ANY = 10.0
 """Range of the logarithm of what such a count may be."""
-RADII_M = (0.02, 1.0)
-"""Radii [m] that wheels of vehicles have."""
 _WIDEST = 0.5
 """Radius of a wheel over the track, below which it is: wheels of both sides do not meet."""
 _OF_KNOWN = 0.25

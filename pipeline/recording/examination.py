@@ -9,7 +9,7 @@ from pipeline.core import SlipError
 from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_as_wheels
-from pipeline.recording.evidence import RADII_M, equal_motion
+from pipeline.recording.evidence import equal_motion
 from pipeline.recording.extract import Given
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import Geometry, explain_wheels
@@ -36,6 +36,7 @@ from pipeline.recording.timeouts import ask_delay, ask_timeout
 from pipeline.recording.units import ask_gyro, ask_metres, ask_units
 from pipeline.run import GROUND_UNOBSERVABLE, Alignment
 from pipeline.sources import (
+    RADII_M,
     Configuration,
     DriveSource,
     PoseContent,

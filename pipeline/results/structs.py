@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from pipeline.core import NORMAL_95, round_numbers
-from pipeline.models import Asked, Number, list_effects, split_determined
+from pipeline.models import Asked, Number, split_determined
 from pipeline.recording import Finding
 from pipeline.sources import Vehicle
 from pipeline.store import convert_stored
@@ -104,6 +104,8 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
         that the run knows is as large as is typical of the effect: commands that arrive late matter in
         another drive.
         """
+        from pipeline.models import list_effects  # noqa: PLC0415 - heavy
+
         kind = next((kind for kind in list_effects() if kind.id == self.id), None)
         return self.corrected or any(
             parameter.is_large(value.value) and not value.is_open(parameter)

@@ -37,6 +37,7 @@ else:
             ),
             "configuration": (
                 "LENGTH_UNITS",
+                "RADII_M",
                 "RANGES",
                 "UNKNOWN_VEHICLE",
                 "Configuration",

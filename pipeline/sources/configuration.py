@@ -357,6 +357,8 @@ class OwnUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: float = 0.0
 
 
+RADII_M: Final = (0.02, 1.0)
+"""Radii [m] that wheels of vehicles have."""
 UNKNOWN_VEHICLE: Final = "unknown"
 """Id of the vehicle that stands in where nothing identifies the log's."""
 

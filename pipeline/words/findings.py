@@ -17,7 +17,8 @@ from pipeline.core import (
     name_first,
     suffix_unit,
 )
-from pipeline.recording import RADII_M, Finding
+from pipeline.recording import Finding
+from pipeline.sources import RADII_M
 
 Values = Mapping[str, Any]
 """The values of a finding, and ``where`` it is."""

@@ -230,7 +230,7 @@ def test_one_encoder_against_the_command_is_reported(tmp_path: Path) -> None:
     record(make(), tmp_path / "run.mcap")
     (tmp_path / "run.toml").write_text('[wheels]\nreversed = "left"\n')
     made = analyze(tmp_path / "run.mcap", tmp_path / "results")
-    assert "one side of the wheels runs backward" in made.findings["signs_contradict"]
+    assert 'gives reversed = "left", which contradicts' in made.findings["configured_wrongly"]
     assert not made.named
 
 

@@ -101,7 +101,7 @@ def test_of_many_poses_those_with_most_messages_are_compared_and_the_others_coun
     drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = add_topics(drive, "odometries", FEW)
-    calls = count_calls(monkeypatch, pose_choice, "extract_tables")
+    calls = count_calls(monkeypatch, pose_choice, "Extraction")
     choice = inspect_log(path, OPTIONS).choice
     assert choice is not None
     assert len(calls) == len(choice.ratings) == MOST_POSES

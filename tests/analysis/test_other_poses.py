@@ -264,8 +264,8 @@ def record_unknown(drive: DrawnDrive, spelling: str) -> DrawnTopic:
 @pytest.mark.parametrize(
     ("spelling", "said"),
     [
-        ("flat", '[pose] x = "/tracker.x"; y = "/tracker.y"; yaw = "/tracker.theta"'),
-        ("json", '[pose] x = "/tracker.state.pos_x"; y = "/tracker.state.pos_y"; yaw = "/tracker.heading"'),
+        ("flat", 'pose = {x = "/tracker.x", y = "/tracker.y", yaw = "/tracker.theta"}'),
+        ("json", 'pose = {x = "/tracker.state.pos_x", y = "/tracker.state.pos_y", yaw = "/tracker.heading"}'),
         ("place", "/tracker has positions (position.x, position.y)"),
     ],
 )
@@ -279,9 +279,8 @@ def test_a_log_without_a_known_pose_names_fields_that_look_like_one(
     assert caught.value.code == "no_pose"
     assert said in str(caught.value)
     assert "None of its topics" not in str(caught.value)
-    if "[pose]" in said:
-        lines = said.replace("[pose] ", "[pose]\n").replace("; ", "\n")
-        (tmp_path / "run.toml").write_text(lines, encoding="utf-8")
+    if "pose = " in said:
+        (tmp_path / "run.toml").write_text(said, encoding="utf-8")
         check_poses(extract_drawn(log), drive)
 
 

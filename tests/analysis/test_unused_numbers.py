@@ -44,7 +44,7 @@ def test_two_numbers_a_message_are_named_with_the_lines_that_use_them(
         f'{side}_topic = "{topic}.data[{number}]"' for number, side in enumerate(("left", "right"))
     )
     assert said.startswith(f"not used: {topic} (two numbers a message)")
-    assert f"[{role}] {left}; {right}" in said
+    assert f"{role} = {{{left}, {right}}}" in said
     lines = "\n".join((f"[{role}]", left, right, 'unit = "rad/s"'))
     (tmp_path / "run.toml").write_text(lines, encoding="utf-8")
     table = extract_drawn(log, "wheels" if role == "wheels" else "commands")
@@ -71,10 +71,9 @@ def test_a_topic_with_quotes_is_written_as_toml_reads_it(tmp_path: Path) -> None
     speeds = record_numbers(drive, wheel_speeds(drive), topic)
     log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, speeds)
     said = read_findings(log)["numbers_not_used"]
-    lines = said.partition("[wheels] ")[2].partition(" (the motion")[0].split("; ")
-    assert tomllib.loads("\n".join(lines)) == {
-        "left_topic": f"{topic}.data[0]",
-        "right_topic": f"{topic}.data[1]",
+    line = said.partition("in run.toml: ")[2].partition(" (the motion")[0]
+    assert tomllib.loads(line) == {
+        "wheels": {"left_topic": f"{topic}.data[0]", "right_topic": f"{topic}.data[1]"}
     }
 
 
@@ -119,7 +118,7 @@ def test_left_and_right_numbers_of_an_unknown_type_are_named_with_the_lines_that
     log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, *topics)
     said = read_findings(log)["numbers_not_used"]
     left, right = (f'{side}_topic = "{name}"' for side, name in zip(("left", "right"), names, strict=True))
-    assert f"[wheels] {left}; {right}" in said
+    assert f"wheels = {{{left}, {right}" in said
     unit = 'unit = "ticks"\nper_turn = 1000' if split else 'unit = "rad/s"'
     (tmp_path / "run.toml").write_text(f"[wheels]\n{left}\n{right}\n{unit}", encoding="utf-8")
     assert not extract_drawn(log, "wheels").is_empty()

@@ -153,10 +153,3 @@ def test_a_batch_that_is_stopped_says_so(field: Path, number: int, code: int) ->
         process.send_signal(number)
         assert process.communicate(timeout=30)[1] == "slip: stopped; the same command continues\n"
     assert process.returncode == code
-
-
-@pytest.mark.parametrize(
-    "words", [("batch",), ("batch", "x", "--shard", "5/4"), ("batch", "x", "--quota", "1GB")]
-)
-def test_words_that_are_not_understood_end_with_2(words: tuple[str, ...]) -> None:
-    assert run_slip(*words)[0] == 2

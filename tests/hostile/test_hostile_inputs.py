@@ -39,8 +39,11 @@ WORDS: list[tuple[str, str]] = [
     # Files of another kind, and names that nobody has
     ("analyze field/wide.mcap --config missing.toml", "missing.toml"),
     ("analyze field/wide.mcap --vehicle huskyA200", r"presets are husky_a200, "),
-    ("analyze field/wide.mcap --wheel-radius 16 --track-width .5", r"it is in centimetres, write 0\.16\."),
-    ("analyze field/wide.mcap --wheel-radius .1 --track-width 555", r"it is in centimetres, write 5\.55\."),
+    (
+        "analyze field/wide.mcap --wheel-radius 16 --track-width .5",
+        r"it is in centimetres, write 0\.16; if it is in millimetres, write 0\.016\.",
+    ),
+    ("analyze field/wide.mcap --wheel-radius .1 --track-width 555", r"it is in centimetres, write 5\.55; if"),
     ("analyze field/wide.mcap --wheel-radius 330 --track-width .5", r"it is in millimetres, write 0\.33\."),
     ("analyze field/wide.mcap --drove 2", "2 is not a length with its unit"),
     ("analyze planned/dead.mcap", r"planned/dead\.mcap: it is a link to nothing\. Look where it leads"),
