@@ -126,7 +126,7 @@ def ask_floors(folder: Path, results: Path) -> Iterator[Answer]:
 def ask_slalom(folder: Path, results: Path) -> Iterator[Answer]:
     """Trials of a small car, 5 to 10 s each: only together they say anything."""
     content = ask(analyze(sorted(folder.glob("*.bag")), results))
-    said = str(content.get("refused") or ", ".join(read_numbers(content)) or "nothing named")
+    said = str(content.get("code") or ", ".join(read_numbers(content)) or "nothing named")
     verdict = "right" if content.get("ladder") else "refused"
     yield Answer("four trials of seconds together", "a model", said, verdict)
 
@@ -152,7 +152,7 @@ def ask(runs: Sequence[slip.Run], **how: Any) -> Content:  # noqa: ANN401 - as `
     try:
         diagnosis = runs[0].diagnose(*runs[1:], **how)
     except slip.SlipError as error:
-        return {"refused": error.code}
+        return {"code": error.code}
     return {**diagnosis.to_json(), "named_model": diagnosis.model}
 
 
@@ -188,8 +188,8 @@ def judge_number(question: str, near: tuple[float, float], content: Content, *na
         return Answer(question, format_near(near), f"{numbers[name]:.4f}", rate(is_near(numbers[name], near)))
     groups = [one for one in list_groups(content) if {label.partition(".")[0] for label in names} & one]
     said = " | ".join(sorted(groups[0])) if groups else ", ".join(numbers) or "nothing named"
-    verdict = "refused" if "refused" in content else "undecided" if groups else "wrong"
-    return Answer(question, format_near(near), str(content.get("refused", said)), verdict)
+    verdict = "refused" if "code" in content else "undecided" if groups else "wrong"
+    return Answer(question, format_near(near), str(content.get("code", said)), verdict)
 
 
 def judge_undecided(question: str, wanted: set[str], content: Content) -> Answer:
@@ -198,8 +198,8 @@ def judge_undecided(question: str, wanted: set[str], content: Content) -> Answer
     said = (
         "; ".join(" | ".join(sorted(one)) for one in groups) or ", ".join(read_numbers(content)) or "nothing"
     )
-    verdict = "refused" if "refused" in content else rate(any(wanted <= one for one in groups))
-    return Answer(question, " | ".join(sorted(wanted)), str(content.get("refused", said)), verdict)
+    verdict = "refused" if "code" in content else rate(any(wanted <= one for one in groups))
+    return Answer(question, " | ".join(sorted(wanted)), str(content.get("code", said)), verdict)
 
 
 def list_groups(content: Content) -> list[set[str]]:

@@ -31,7 +31,7 @@ def test_a_number_is_right_within_its_margin_and_under_its_own_name() -> None:
     assert judge(make_content(("wheel_radius", "k", 1.0141))) == "wrong"
     assert judge(make_content()) == "wrong"
     assert judge(make_content(undecided=(["effective_track", "yaw_drift"],))) == "undecided"
-    assert judge({"refused": "too_short"}) == "refused"
+    assert judge({"code": "too_short"}) == "refused"
 
 
 def test_an_open_question_needs_all_its_candidates_in_one_group() -> None:
