@@ -148,7 +148,7 @@ def _describe_replaced(before: Manifest, now: Manifest) -> str:
     lost = [name for name, file in parts.items() if file in before.files and file not in now.files]
     made += [f"with a {enumerate_texts(lost)}, which the new ones lack"] if lost else []
     where = spell_location(before.folder)
-    return f"{'; '.join(made)}; they are kept in {where} until slip batch --prune" if made else ""
+    return f"{'; '.join(made)}; they are kept in {where} until slip batch --prune --keep 0" if made else ""
 
 
 def _list_choices(manifest: Manifest) -> dict[str, object]:

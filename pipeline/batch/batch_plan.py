@@ -185,7 +185,10 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
     for task in tasks:
         if task.path in copies:
             reason = copies[task.path]
-            entry = Entry(log=task.log, fingerprint=task.fingerprint, state="copy", reason=reason)
+            content = LogIdentities(store).lookup(task.path) or ""
+            entry = Entry(
+                log=task.log, fingerprint=task.fingerprint, state="copy", key=content, reason=reason
+            )
             Ledger(store).write(entry)
             settled.append(entry)
         elif task.log.path not in done:
@@ -237,8 +240,14 @@ def _is_settled(
         return entry.lasts or not request.retries_quarantined
     if entry.state == "copy":
         original = manifests.get(entry.reason)
-        path = "" if original is None else str(original.part("log").get("path"))
-        return bool(path) and (entry.reason in owners or "://" in path or Path(path).exists())
+        log = {} if original is None else original.part("log")
+        path = str(log.get("path") or "")
+        # The run may hold another content by now.
+        return (
+            bool(path)
+            and entry.key in {"", str(log.get("sha256"))}
+            and (entry.reason in owners or "://" in path or Path(path).exists())
+        )
     if entry.state not in WITH_RESULTS or manifest is None or owners.get(entry.run) != task.log.path:
         return False
     return manifest.key == entry.key and (entry.has_report or not request.options.report)

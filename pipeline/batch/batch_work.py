@@ -63,7 +63,7 @@ class Entry:
         fingerprint: hash of everything beside the log that its results depend on (`find_fingerprint`).
         state: one of `STATES` but ``unchanged``, or ``copy`` of another log's content.
         run: name of its run; empty if it has none.
-        key: key of the generation that was made.
+        key: key of the generation that was made; of a copy, the SHA-256 of its content if it is known.
         code: code of the error.
         reason: reason of the failure or refusal, or what was lost; of a copy, the run it is a copy of.
         hint: what to do about it.

@@ -164,34 +164,56 @@ def examine(given: Given) -> Recording:
     """Decide which reading of a log's signals makes its body move as it does.
 
     Where something contradicts the log as run.toml reads it, it is examined without each section's keys for
-    units, signs and scales, too. A section without which nothing is contradicted that was not before is
-    wrong, and no radius, gain or wiring is blamed for it.
+    units, signs and scales, too, and without all of them. Those without which nothing is contradicted that
+    was not before are wrong, and no radius, gain or wiring is blamed for it.
 
     Returns:
         What is in the log; without a pose in it where nothing can stand in for one.
     """
     recording = _examine(given)
     doubts = _list_doubts(recording, given)
-    for role in ("command", "wheels", "pose", "imu") if doubts else ():
-        section = getattr(given.configuration, role)
-        usual = type(section)()
-        keys = [key for key in _READ_AS if getattr(section, key, None) != getattr(usual, key, None)]
-        if not keys:
-            continue
-        plain = msgspec.structs.replace(section, **{key: getattr(usual, key) for key in keys})
-        without = msgspec.structs.replace(given.configuration, **{role: plain})
+    lines = _list_readings(given.configuration) if doubts else {}
+    # Each section alone, and then all: who mistakes a unit does so in both.
+    for roles in [*([role] for role in lines), *([[*lines]] if len(lines) > 1 else [])]:
+        plain = {
+            role: msgspec.structs.replace(
+                getattr(given.configuration, role),
+                **{key: getattr(type(getattr(given.configuration, role))(), key) for key in lines[role]},
+            )
+            for role in roles
+        }
+        without = msgspec.structs.replace(given.configuration, **plain)
         if _list_doubts(_examine(replace(given, configuration=without)), given) < doubts:
-            given_as = {key: getattr(section, key) for key in keys}
-            wrong = Finding("configured_wrongly", "error", role, {"given": given_as})
-            return replace(recording, findings=(wrong,))
+            wrong = [Finding("configured_wrongly", "error", role, {"given": lines[role]}) for role in roles]
+            return replace(recording, findings=tuple(wrong))
     return recording
 
 
+def _list_readings(configuration: Configuration) -> dict[str, dict[str, object]]:
+    """Keys of run.toml that say how numbers are read, with their values, by section."""
+    lines = dict[str, dict[str, object]]()
+    for role in ("command", "wheels", "pose", "imu"):
+        section = getattr(configuration, role)
+        usual = type(section)()
+        keys = [key for key in _READ_AS if getattr(section, key, None) != getattr(usual, key, None)]
+        if keys:
+            lines[role] = {key: getattr(section, key) for key in keys}
+    return lines
+
+
 def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
-    """What contradicts a reading of a log: findings, and scales that no such vehicle has."""
-    doubts = {(one.id, one.where) for one in recording.findings if one.severity != "info"}
+    """What contradicts a reading: errors, corrections, and scales that no such vehicle has."""
+    doubts = {
+        (one.id, one.where)
+        for one in recording.findings
+        if one.severity == "error" or one.id == "command_scale" or one.values.get("kind") == "corrected"
+    }
     if recording.refused is not None:
         doubts.add((recording.refused.id, recording.refused.where))
+    if recording.is_still or not any(
+        one.ahead or one.turned for one in recording.evidence if one.role != "gyro"
+    ):
+        doubts.add(("still", "pose"))
     radius = given.vehicle.wheel_radius_m
     radii = (radius / _ALIKE, radius * _ALIKE) if given.is_known else RADII_M
     ranges = {"gyro": [(1.0 / _ALIKE, _ALIKE)]}

@@ -12,7 +12,7 @@ from pipeline.words.findings import format_finding
 LOG = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
 
 
-def find_what_is_told(tmp_path: Path, section: str, line: str) -> list[str]:
+def find_what_is_told(tmp_path: Path, section: str, line: str, count: int = 1) -> list[str]:
     place = tmp_path / "drive"
     place.mkdir()
     (place / LOG.name).write_bytes(LOG.read_bytes())
@@ -20,7 +20,7 @@ def find_what_is_told(tmp_path: Path, section: str, line: str) -> list[str]:
     answer = analyze_log(place / LOG.name, Options(out=tmp_path / "results", report=False, diagnosis=False))
     findings = read_findings(answer.summary)
     assert [one.id for one in findings if one.severity == "error"] == (
-        ["configured_wrongly"] if "rad/s" not in line else []
+        ["configured_wrongly"] * count if "rad/s" not in line else []
     )
     return [format_finding(one) for one in findings]
 
@@ -44,6 +44,12 @@ def test_a_line_that_the_log_contradicts_is_named_and_nothing_else(
     told = find_what_is_told(tmp_path, section, line)
     assert any(f"[{section}] in run.toml" in one and line in one for one in told)
     assert not any("--wheel-radius" in one or "wired" in one for one in told)
+
+
+def test_the_same_mistake_in_two_sections_is_named_in_both(tmp_path: Path) -> None:
+    both = 'unit = "rpm"\n[wheels]\nunit = "rpm"'
+    told = [one for one in find_what_is_told(tmp_path, "command", both, 2) if "contradicts" in one]
+    assert [one.partition(" in run.toml")[0] for one in told] == ["[command]", "[wheels]"]
 
 
 @pytest.mark.parametrize("section", ["wheels", "imu"])

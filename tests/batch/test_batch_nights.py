@@ -1,5 +1,6 @@
 """A batch of every night: what it keeps, what it tells and how it ends."""
 
+import hashlib
 import os
 import signal
 import subprocess
@@ -153,3 +154,18 @@ def test_a_batch_that_is_stopped_says_so(field: Path, number: int, code: int) ->
         process.send_signal(number)
         assert process.communicate(timeout=30)[1] == "slip: stopped; the same command continues\n"
     assert process.returncode == code
+
+
+def test_a_copy_whose_original_is_replaced_gets_its_own_run(originals: Path, tmp_path: Path) -> None:
+    """It stayed the copy of a run that holds another content, and nothing held its own."""
+    first, second = ((originals / f"{name}.mcap").read_bytes() for name in ("a", "b"))
+    for name in ("x", "y"):
+        (tmp_path / "two" / name).mkdir(parents=True)
+        (tmp_path / "two" / name / "run.mcap").write_bytes(first)
+    words = ("batch", str(tmp_path / "two"), "--results", str(tmp_path / "out"), *INLINE)
+    assert run_slip(*words)[0] == 0
+    (tmp_path / "two" / "x" / "run.mcap").write_bytes(second)
+    for _ in range(2):
+        assert run_slip(*words)[0] == 0
+    held = {manifest.part("log").get("sha256") for manifest in Store(tmp_path / "out").survey().manifests}
+    assert held == {hashlib.sha256(content).hexdigest() for content in (first, second)}

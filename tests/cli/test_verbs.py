@@ -91,7 +91,7 @@ def test_results_that_were_made_otherwise_are_not_replaced_without_a_word(
     kept = {path.name: path.read_bytes() for path in first.iterdir()}
     (line,) = [one for one in print_verb(*every).splitlines() if one.startswith("replaced")]
     assert "earlier results, made with use_intervals = recorded (now all); they are kept in" in line
-    assert "generation-2 until slip batch --prune" in line
+    assert "generation-2 until slip batch --prune --keep 0" in line
     assert {path.name: path.read_bytes() for path in first.iterdir()} == kept
     status = print_verb("results", "status", "good", "--results", tmp_path / "out")
     assert [line.split("/")[-1] for line in status.splitlines() if line.startswith("earlier")] == [
