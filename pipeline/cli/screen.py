@@ -29,7 +29,7 @@ from pipeline.core import (
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, has_no_pose, key_finding, read_findings, read_result
-from pipeline.words.diagnosis import DEAD_ENCODERS, list_lines
+from pipeline.words.diagnosis import has_dead_encoder, list_lines
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -209,7 +209,7 @@ def _format_head(summary: Summary) -> list[str]:
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
     # The verdict states an error without the mark of a finding.
     findings = read_findings(summary)
-    state += ", a dead encoder" * any(one.id in DEAD_ENCODERS for one in findings)
+    state += ", a dead encoder" * has_dead_encoder(findings)
     errors = count_serious(findings).get("error")
     state += f", {errors}" if errors else ""
     if gaps:

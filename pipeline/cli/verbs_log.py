@@ -221,7 +221,7 @@ def _format_log(seen: Inspection, *, everything: bool) -> list[str]:
         ]
     unchecked = f", unchecked: {seen.unchecked}" if seen.unchecked else ""
     noticed = () if seen.choice is None else seen.choice.findings
-    dead = ", with a dead encoder" * any(one.id in words.DEAD_ENCODERS for one in noticed)
+    dead = ", with a dead encoder" * words.has_dead_encoder(noticed)
     lines.append(f"health    {'complete' if not seen.losses else 'with losses'}{dead}{unchecked}")
     lines += _cut([f"  lost    {loss.text}" for loss in seen.losses], everything=everything)
     lines += _cut([f"  note    {words.format_finding(note)}" for note in seen.notes], everything=everything)

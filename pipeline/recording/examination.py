@@ -175,12 +175,10 @@ def examine(given: Given) -> Recording:
     lines = _list_readings(given.configuration) if doubts else {}
     # Each section alone, and then all: who mistakes a unit does so in both.
     for roles in [*([role] for role in lines), *([[*lines]] if len(lines) > 1 else [])]:
+        sections = {role: getattr(given.configuration, role) for role in roles}
         plain = {
-            role: msgspec.structs.replace(
-                getattr(given.configuration, role),
-                **{key: getattr(type(getattr(given.configuration, role))(), key) for key in lines[role]},
-            )
-            for role in roles
+            role: msgspec.structs.replace(one, **{key: getattr(type(one)(), key) for key in lines[role]})
+            for role, one in sections.items()
         }
         without = msgspec.structs.replace(given.configuration, **plain)
         if _list_doubts(_examine(replace(given, configuration=without)), given) < doubts:

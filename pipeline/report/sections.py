@@ -45,7 +45,6 @@ from pipeline.results import (
     split_main,
 )
 from pipeline.words import (
-    DEAD_ENCODERS,
     Cell,
     Column,
     Table,
@@ -59,6 +58,7 @@ from pipeline.words import (
     format_remaining_error,
     format_short,
     format_suggestion,
+    has_dead_encoder,
     list_largest_falls,
     list_terms,
     name_group,
@@ -269,7 +269,7 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     complete = log.get("complete") is not False and not losses
     strip = [("good", "log complete") if complete else ("error", f"log has losses ({max(len(losses), 1)})")]
     findings = list_findings(report)
-    if any(one.id in DEAD_ENCODERS for one in findings):
+    if has_dead_encoder(findings):
         strip.append(("error", "a dead encoder"))
     if report.summary.get("simulated"):
         strip.append(("note", "simulated"))

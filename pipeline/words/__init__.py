@@ -47,7 +47,7 @@ else:
                 "tabulate_pairs",
             ),
             "diagnosis": (
-                "DEAD_ENCODERS",
+                "has_dead_encoder",
                 "VERDICT",
                 "describe",
                 "format_lines",

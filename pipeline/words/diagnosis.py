@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from pipeline.core import (
@@ -106,8 +106,13 @@ _HEADS_SHOWN = 4
 """Most runs that are named one a line by default; the names of more are between the first and the last."""
 _EFFECTS_SHOWN = 5
 """Effects with a line by default."""
-DEAD_ENCODERS = frozenset({"encoder_dead", "wheel_dead"})
-"""Findings on an encoder that does not count."""
+
+
+def has_dead_encoder(findings: Iterable[Finding]) -> bool:
+    """Whether an encoder of the log is dead, at times or throughout."""
+    return any(one.id in {"encoder_dead", "wheel_dead"} for one in findings)
+
+
 _OF_ENCODERS = frozenset(
     {
         "digging_in",
@@ -599,7 +604,7 @@ def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everyt
     """
     by_kind: dict[tuple[Severity, str, str], dict[str, list[str]]] = {}
     for run, findings in runs.items():
-        is_dead = any(one.id in DEAD_ENCODERS for one in findings)
+        is_dead = has_dead_encoder(findings)
         for severity, one, said in _join_incidents(findings):
             text = f"perhaps by the dead encoder: {said}" if is_dead and one.id in _OF_ENCODERS else said
             if text.casefold() not in verdict.casefold():
