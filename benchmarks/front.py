@@ -73,6 +73,8 @@ def judge(change: Change, before: Answer, after: Answer) -> str:
         for name in shared
     )
     news = set(after.told.splitlines()) - set(before.told.splitlines())
+    if change.never:
+        return "WRONG" if any(re.search(change.never, text) for text in news) else "same"
     if change.told and any(re.search(change.told, text) for text in news):
         return "told, same" if same else "told"
     return "same" if same else "WRONG"

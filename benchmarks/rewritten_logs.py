@@ -7,11 +7,12 @@ the program reads a log or what it looks for.
 import json
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
@@ -148,12 +149,13 @@ class Change:
         name: in the table.
         make: the changed log; None where the log has nothing to change.
         told: pattern of a finding that names it; empty where the answer must stay as it was.
-        moves: whether the answer may change where it is told.
+        never: pattern of what must not be said of it; the answer may differ, since the drive is another.
     """
 
     name: str
     make: Callable[[Log, Roles], Log | None]
     told: str = ""
+    never: str = ""
 
 
 def list_changes() -> list[Change]:
@@ -174,6 +176,8 @@ def list_changes() -> list[Change]:
         Change("left encoder dies", _die("left", 0.0), "left wheels' encoder reads (nothing|the same)"),
         Change("right encoder holds", _die("right", None), "right wheels' encoder reads (nothing|the same)"),
         Change("left encoder counts double", _on_wheels(2.0, 1.0), "counts? 2 times|low against the other"),
+        Change("pivots about the left wheels", _pivot(0.6), never="encoder"),
+        Change("nothing but such pivots", _pivot(0.0), never="encoder"),
         Change("positions of the wheels in turns", _on_joints(_turn, "position"), "position"),
         Change("a counter of the wheels jumps", _on_joints(_jump, "position"), "jump"),
         Change("counters of the wheels run over", _on_joints(_run_over, "position"), "jump"),
@@ -448,12 +452,12 @@ def _scale_sides(log: Log, topics: tuple[str, ...], factors: tuple[float, float]
     return _each(log, scale)
 
 
-def _die(side: str, reads: float | None) -> Callable[[Log, Roles], Log | None]:
-    """One encoder reads a number after 60 % of the log, or its last one."""
+def _die(side: str, reads: float | None, begins: float = 0.6) -> Callable[[Log, Roles], Log | None]:
+    """One encoder reads a number after a part of the log, or its last one."""
 
     def make(log: Log, roles: Roles) -> Log | None:
         first, last = log.length
-        dies = first + 0.6 * (last - first)
+        dies = first + begins * (last - first)
         joints, held = _joints(log, roles), dict[str, float]()
 
         def read(name: str, value: float, time: int) -> float:
@@ -480,6 +484,125 @@ def _die(side: str, reads: float | None) -> Callable[[Log, Roles], Log | None]:
         return _each(log, change) if joints or (len(roles.wheels) == 2 and known) else None
 
     return make
+
+
+def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
+    """After a part of the log the left wheels stand, and the body turns about them as the right ones drive.
+
+    What a turn of the wheels is worth in metres and radians is fitted to the unchanged log.
+    """
+
+    def make(log: Log, roles: Roles) -> Log | None:
+        wheels = _read_sides(log, roles)
+        if wheels is None or not _has_pose(log, roles):
+            return None
+        own = [
+            (one.log_time, _find_pose(_copy(one.content))) for one in log.messages if one.topic == roles.pose
+        ]
+        times = np.array([time for time, _ in own])
+        x, y = (np.array([pose["position"][axis] for _, pose in own]) for axis in "xy")
+        yaw = np.unwrap([_yaw(pose) for _, pose in own])
+        middle = 0.5 * (yaw[1:] + yaw[:-1])
+        ahead, turned = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle), np.diff(yaw)
+        left, right = (np.diff(np.interp(times, *wheels[side])) for side in ("left", "right"))
+        metres, turn = (
+            float(moved @ drive / (drive @ drive))
+            for moved, drive in ((ahead, 0.5 * (left + right)), (turned, right - left))
+        )
+        first, last = log.length
+        start = first + begins * (last - first)
+        past = times[1:] > start
+        ahead, turned = np.where(past, 0.5 * metres * right, ahead), np.where(past, turn * right, turned)
+        aside = np.where(past, 0.0, np.diff(y) * np.cos(middle) - np.diff(x) * np.sin(middle))
+        headings = yaw[0] + np.cumsum(turned)
+        middle = headings - 0.5 * turned
+        motions = zip(
+            np.cumsum(ahead * np.cos(middle) - aside * np.sin(middle)) + x[0],
+            np.cumsum(ahead * np.sin(middle) + aside * np.cos(middle)) + y[0],
+            headings,
+            ahead * 1e9 / np.maximum(np.diff(times), 1),
+            turned * 1e9 / np.maximum(np.diff(times), 1),
+            strict=True,
+        )
+        poses = dict(zip(times[1:].tolist(), motions, strict=True))
+        stands = _die("left", None, begins)(log, roles)
+        span = abs(metres / turn)
+
+        def change(one: Message) -> Message | None:
+            if one.topic.endswith("tf_static"):
+                return one
+            if one.topic in roles.wheels:
+                return _stop_left(one, ("velocity",)) if one.log_time > start else one
+            if one.topic == roles.pose:
+                return _move(one, poses[one.log_time]) if one.log_time in poses else one
+            if one.topic in roles.command:
+                return _command_right(one, span) if one.log_time > start else one
+            return None
+
+        return None if stands is None else _each(stands, change)
+
+    return make
+
+
+def _read_sides(log: Log, roles: Roles) -> dict[str, tuple[Any, Any]] | None:
+    """Times [ns] and angles of the left and the right wheels of a vehicle that does not steer."""
+    found: dict[str, tuple[list[int], list[float]]] = {"left": ([], []), "right": ([], [])}
+    for one in log.messages:
+        if one.topic not in roles.wheels:
+            continue
+        if hasattr(one.content, "velocity"):
+            speeds = dict(zip(one.content.name, one.content.velocity, strict=False))
+        else:
+            speeds = {one.topic: getattr(one.content, "data", None)}
+        for side, (times, rates) in found.items():
+            own = [speed for name, speed in speeds.items() if side in name]
+            if "steer" in "".join(speeds) or any(not isinstance(speed, float) for speed in own):
+                return None
+            if own:
+                times.append(one.log_time)
+                rates.append(sum(own) / len(own))
+    if any(len(times) < 2 for times, _ in found.values()):
+        return None
+    return {
+        side: (np.array(times), np.cumsum(np.array(rates) * np.gradient(np.array(times)) / 1e9))
+        for side, (times, rates) in found.items()
+    }
+
+
+def _move(one: Message, motion: tuple[float, ...]) -> Message:
+    """A message of poses, and of speeds where it has them, with another motion."""
+    content = _copy(one.content)
+    pose, (x, y, yaw, ahead, turning) = _find_pose(content), motion
+    pose["position"] |= {"x": x, "y": y}
+    pose["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)}
+    if "twist" in content:
+        twist = content["twist"]["twist"]
+        twist["linear"] |= {"x": ahead, "y": 0.0}
+        twist["angular"] |= {"z": turning}
+    return replace(one, content=content)
+
+
+def _command_right(one: Message, span: float) -> Message:
+    """A command of which the left wheels get nothing, on wheels that are a span [m] apart."""
+    content = _copy(one.content)
+    if isinstance(content, dict) and ("linear" in content or "twist" in content):
+        twist = content.get("twist", content)
+        right = twist["linear"]["x"] + 0.5 * span * twist["angular"]["z"]
+        twist["linear"]["x"], twist["angular"]["z"] = 0.5 * right, right / span
+        return replace(one, content=content)
+    return _stop_left(one, ("velocity", "position"))
+
+
+def _stop_left(one: Message, fields: Sequence[str]) -> Message:
+    """A message of joints, or of a side's speed, with zero for the left wheels."""
+    content = _copy(one.content)
+    if isinstance(content, dict) and "name" in content:
+        for field in fields:
+            values = zip(content["name"], content[field], strict=False)
+            content[field] = [0.0 if "left" in name else value for name, value in values]
+    elif "left" in one.topic:
+        content = {"data": 0.0}
+    return replace(one, content=content)
 
 
 def _find_factor(joint: str, factors: tuple[float, float]) -> float:

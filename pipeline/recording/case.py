@@ -185,6 +185,11 @@ class Case:
         return self.given.vehicle
 
     @property
+    def track_m(self) -> float | None:
+        """Distance of the vehicle's sides [m]; None where it is not known."""
+        return self.vehicle.track_width_m if self.is_known else None
+
+    @property
     def configuration(self) -> Configuration:
         """The user's configuration."""
         return self.given.configuration

@@ -11,6 +11,7 @@ from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.drive import choose_sides
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, compare, fit, measure_share
+from pipeline.recording.outages import turns_about
 from pipeline.recording.readings import SIDES, Held
 from pipeline.sources import DriveForm, DriveSection
 
@@ -270,9 +271,9 @@ def _report_sides(case: Case) -> bool:
 
 
 def _report_dead(case: Case) -> bool:
-    """Whether the encoder of a side is dead, which is told."""
+    """Whether the encoder of a side is dead, which is told: it may stand where the body turns about it."""
     dead = case.wheels.reading.dead_side
-    if not dead:
+    if not dead or (case.has_pose and turns_about(dead, case.motion, case.track_m)):
         return False
     other = next(side for side in SIDES if side != dead)
     values = {"side": dead, "other": other, "has_pose": case.has_pose}

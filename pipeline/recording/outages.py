@@ -38,6 +38,8 @@ _ALONG = 0.1
 tells of both: noise of poses is less."""
 _ASIDE = 0.3
 """Part of a block's drive across it, over all drives' root mean square, of which it tells nothing."""
+_LEVERS_M = (0.05, 2.0)
+"""Distances [m] of a vehicle's middle from its wheels."""
 _EXACT = 0.95
 """Share of the readings that are one value, from which on an encoder holds it."""
 
@@ -172,7 +174,7 @@ def find_outages(
         return []
     moved = asked = None
     if motion.is_known:
-        moved = np.column_stack([blocks.average(one) for one in (motion.body.real, motion.yaw)])
+        moved = _average(motion, blocks)
     known = np.ones(blocks.elapsed.size, dtype=bool)
     if command.explained.is_known:
         made = command.explained
@@ -200,8 +202,43 @@ def find_outages(
             # With one witness alone the other side is the second one.
             others = [other for key, other in read.items() if key != name and other is not None]
             beside = others[0].usual - others[0].broad if others else np.zeros(known.size)
-        outages += _list_dead(name, side, late[1], blocks, one, of_side[name], beside)
+        outages += _list_dead(name, side, late[1], blocks, one, of_side[name], beside, track_m)
     return _join_sides(sorted(outages, key=lambda one: one.start))
+
+
+def turns_about(side: str, motion: Motion, track_m: float | None) -> bool:
+    """Whether a body turns about the wheels of one side throughout; see `_turns_about`."""
+    return motion.is_known and _turns_about(side, _average(motion, _cut(motion.steps)), track_m)
+
+
+def _average(motion: Motion, blocks: _Blocks) -> Floats:
+    """Rates ahead and of the heading in blocks, shape (m, 2)."""
+    return np.column_stack([blocks.average(one) for one in (motion.body.real, motion.yaw)])
+
+
+def _turns_about(side: str, moved: Floats, track_m: float | None) -> bool:
+    """Whether a body turns about the wheels of one side: its speed and its yaw rate go together.
+
+    Then wheels that stand explain what it does, and a dead encoder is not needed for it.
+
+    Args:
+        side: ``left`` or ``right``.
+        moved: rates ahead and of the heading in blocks, shape (m, 2).
+        track_m: distance of the sides; the middle is half of it from these wheels, to a factor of two, since
+            wheels slip to the side in turns. None for any that vehicles have.
+    """
+    ahead, turned = moved.T
+    if ahead.size < _SMALLEST_PART or not turned.any():
+        return False
+    made = fit_robustly(turned[:, None], ahead)
+    lever = float(made.gains[0]) * (1.0 if side == "left" else -1.0)
+    low, high = _LEVERS_M if track_m is None else (0.25 * track_m, track_m)
+    least = _LEAST * float(np.quantile(np.abs(ahead), 0.95)) + _STILL
+    with_it, without = (
+        float(list_likelihoods(rest, float(np.hypot(find_scale(rest), least))).sum())
+        for rest in (made.rest, ahead)
+    )
+    return low < lever < high and with_it - without > price_change(ahead.size)
 
 
 def _roll_given(name: str, moved: Floats | None, blocks: _Blocks, track_m: float | None) -> list[Floats]:
@@ -285,6 +322,7 @@ def _list_dead(
     one: _Side,
     sources: Sequence[Floats],
     goes_on: Floats,
+    track_m: float | None,
 ) -> list[Outage]:
     """Spans in which the readings are none, and silences of a side.
 
@@ -296,6 +334,7 @@ def _list_dead(
         one: the readings in blocks.
         sources: columns of what they may follow.
         goes_on: gain in likelihood where the other signals agree, shape (m,).
+        track_m: distance of the sides, if it is given.
     """
     gains = np.column_stack((_rate_repeating(one.values, one.fits), one.broad)) - one.usual[:, None]
     gains[~(one.there & np.any([fit.spanned for fit in one.fits], axis=0))] = 0.0
@@ -310,22 +349,27 @@ def _list_dead(
         rows = np.arange(part.start, part.stop)[inside]
         columns = [each[rows] for each in sources]
         if goes_on[rows].sum() > price and not _follows_otherwise(
-            one.values[rows], columns, one.fits, span, 2.0 * price
+            one.values[rows], columns, one.fits, span, 2.0 * price, track_m
         ):
             made.append(span)
     return made + _list_silent(name, side, blocks, one.fits[0].expected, one.top)
 
 
 def _follows_otherwise(
-    values: Floats, sources: Sequence[Floats], fits: Sequence[_Follows], outage: Outage, price: float
+    values: Floats,
+    sources: Sequence[Floats],
+    fits: Sequence[_Follows],
+    outage: Outage,
+    price: float,
+    track_m: float | None,
 ) -> bool:
     """Whether a source explains a span by numbers of its own, as on other ground or at a limit.
 
     Noise is what nothing explains. A value that stands throughout is one that no source has; that of zero is
-    explained by no gain at all.
+    explained by no gain at all, but by a body that turns about the wheels that stand.
     """
     if outage.reads == "zero":
-        return False
+        return outage.side in SIDES and _turns_about(outage.side, sources[0][:, :2], track_m)
     # The blocks of each source and those before them, not as many numbers as there are blocks.
     counts = [min(columns.shape[1] // 3 * 2, values.size // 3) for columns in sources]
     rests = [fit_robustly(one[:, :count], values).rest for one, count in zip(sources, counts, strict=True)]
@@ -438,7 +482,7 @@ def ask_outages(case: Case) -> Case:
     late = (reading.explained.lag, reading.explained.delay)
     asked = case.command.reading if case.command.is_sure else Reading()
     poses = case.motion if case.has_pose else NO_MOTION
-    track_m = case.vehicle.track_width_m if case.is_known and reading.form == "sides" else None
+    track_m = case.track_m if reading.form == "sides" else None
     outages = find_outages(sides, late, asked, poses, track_m)
     if not outages:
         return case

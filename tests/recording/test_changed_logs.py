@@ -30,6 +30,8 @@ QUICK = {
     ("husky_tile", "clock back by 10 s"),
     ("ackermann_gravel", "both encoders backward"),
     ("husky_tile", "left encoder dies"),
+    ("husky_tile", "pivots about the left wheels"),
+    ("turtlebot4", "nothing but such pivots"),
     ("turtlebot4", "right encoder holds"),
     ("husky_tile", "poses in JSON"),
     ("husky_tile", "wheels in rpm"),
