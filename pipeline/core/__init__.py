@@ -48,6 +48,7 @@ from pipeline.core.text import (
     format_duration,
     format_errors,
     format_interval,
+    format_key,
     format_length,
     format_part,
     format_recorded,

@@ -1,6 +1,5 @@
 """Notes on runs of one vehicle whose logs were corrected in different ways."""
 
-import json
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -8,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import msgspec
 import polars as pl
 
-from pipeline.core import NORMAL_95, enumerate_texts, group_by, mapping_in, name_first
+from pipeline.core import NORMAL_95, enumerate_texts, format_key, group_by, mapping_in, name_first
 from pipeline.recording import SURE, Finding, are_apart
 from pipeline.results import read_finding_table
 from pipeline.sources import Configuration
@@ -102,13 +101,7 @@ def _are_alike(one: JSON, other: JSON) -> bool:
 
 def _format_lines(lines: Mapping[str, JSON]) -> str:
     """Keys of run.toml with their values."""
-    return enumerate_texts([f"{key} = {_format_value(value)}" for key, value in lines.items()])
-
-
-def _format_value(value: JSON) -> str:
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{json.dumps(key)} = {_format_value(one)}' for key, one in value.items())}}}"
-    return f"{value:g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+    return enumerate_texts([format_key(key, value) for key, value in lines.items()])
 
 
 _MOUNTINGS = {

@@ -1,6 +1,5 @@
 """Set-up of one log: configuration, vehicle and topics, what it lacks, and what it has of no known type."""
 
-import json
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from pipeline.core import SlipError, format_section
+from pipeline.core import SlipError, format_key, format_section
 from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
 from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.findings import Finding, Severity, blame_damage
@@ -321,8 +320,10 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
         if values is None or not is_side or not np.ptp(values, axis=0).all():
             continue
         role = "command" if COMMANDED.search(topic.lower()) else "wheels"
-        left, right = (_quote(f"{topic}.{field}[{number}]") for number in range(len(SIDES)))
-        line = format_section(role, [f"left_topic = {left}", f"right_topic = {right}"])
+        topics = [
+            format_key(f"{side}_topic", f"{topic}.{field}[{number}]") for number, side in enumerate(SIDES)
+        ]
+        line = format_section(role, topics)
         what = (
             f"{topic} ({_WHEELS[count]} numbers a message), whose meaning is not known; if they are "
             f"{'the left and right wheels' if count == len(SIDES) else _SEVERAL}, in run.toml: "
@@ -384,17 +385,12 @@ def _offer(sides: _Sides) -> Finding:
     unit, about = next(
         (of for word, of in _UNITS.items() if re.search(word, sides.left.lower())), ((), _ANY_UNIT)
     )
-    topics = (f"left_topic = {_quote(sides.left)}", f"right_topic = {_quote(sides.right)}")
+    topics = (format_key("left_topic", sides.left), format_key("right_topic", sides.right))
     what = (
         f"{sides.left} and {sides.right}, whose meaning is not known; if they are the left and "
         f"right wheels, in run.toml: {format_section(sides.role, (*topics, *unit))}{about}"
     )
     return Finding("numbers_not_used", "warning", sides.topic, {"what": what})
-
-
-def _quote(name: str) -> str:
-    """A string of TOML."""
-    return json.dumps(name, ensure_ascii=False)
 
 
 def _name_right(match: re.Match[str]) -> str:
@@ -409,7 +405,7 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         if MEASURED.search(topic.lower()):
             continue
         if plain_type(index.types[topic]) == JOYSTICK:
-            axes = [f"{key} = {_quote(f'{topic}.axes[{one}]')}" for key, one in _AXES.items()]
+            axes = [format_key(key, f"{topic}.axes[{one}]") for key, one in _AXES.items()]
             what = (
                 f"{topic} (a joystick); if two of its axes are the command, in run.toml: "
                 f"{format_section('command', axes)} (which axes, the set-up of its driver says)"
@@ -422,9 +418,9 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         turns += [("steering_topic", path) for path, end in ends.items() if _STEER.search(end)]
         if speeds and turns:
             key, turn = turns[0]
-            speed, turn = (_quote(f"{topic}.{path}") for path in (speeds[0], turn))
+            lines = (format_key("speed_topic", f"{topic}.{speeds[0]}"), format_key(key, f"{topic}.{turn}"))
             what = (
                 f"{topic} (a speed and a turn), whose meaning is not known; if it is the command, "
-                f"in run.toml: {format_section('command', [f'speed_topic = {speed}', f'{key} = {turn}'])}"
+                f"in run.toml: {format_section('command', lines)}"
             )
             yield Finding("numbers_not_used", "warning", topic, {"what": what})

@@ -1,6 +1,5 @@
 """Sentences of findings: one template an id, formatted with the values of the finding."""
 
-import json
 import math
 import string
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +11,7 @@ from pipeline.core import (
     format_count,
     format_duration,
     format_errors,
+    format_key,
     format_length,
     format_share,
     name_first,
@@ -976,10 +976,7 @@ def _configured(of: Values) -> str:
 
 
 def _configured_wrongly(of: Values) -> str:
-    given = [
-        key if isinstance(value, dict) else f"{key} = {json.dumps(value)}"
-        for key, value in of["given"].items()
-    ]
+    given = [key if isinstance(value, dict) else format_key(key, value) for key, value in of["given"].items()]
     return (
         f"[{of['where']}] in run.toml (or in a fleet.toml above it) gives {enumerate_texts(given)}, which "
         "contradicts the other signals; without it they agree: take it out"
