@@ -37,7 +37,7 @@ _ALONG = 0.1
 """Extent of a drive across its main direction, of speeds and yaw rates, over that along it, from which on it
 tells of both: noise of poses is less."""
 _ASIDE = 0.3
-"""Part of a block's drive across it, over all drives' root mean square, of which it tells nothing."""
+"""Part of a drive across its main direction, over its usual size, of which it tells nothing."""
 _LEVERS_M = (0.05, 2.0)
 """Distances [m] of a vehicle's middle from its wheels."""
 _EXACT = 0.95
@@ -233,12 +233,7 @@ def _turns_about(side: str, moved: Floats, track_m: float | None) -> bool:
     made = fit_robustly(turned[:, None], ahead)
     lever = float(made.gains[0]) * (1.0 if side == "left" else -1.0)
     low, high = _LEVERS_M if track_m is None else (0.25 * track_m, track_m)
-    least = _LEAST * float(np.quantile(np.abs(ahead), 0.95)) + _STILL
-    with_it, without = (
-        float(list_likelihoods(rest, float(np.hypot(find_scale(rest), least))).sum())
-        for rest in (made.rest, ahead)
-    )
-    return low < lever < high and with_it - without > price_change(ahead.size)
+    return low < lever < high and find_scale(made.rest) < _ASIDE * find_scale(ahead)
 
 
 def _roll_given(name: str, moved: Floats | None, blocks: _Blocks, track_m: float | None) -> list[Floats]:

@@ -18,7 +18,7 @@ from pipeline.analysis import Options
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.motion import NO_MOTION
-from pipeline.recording.outages import Outage, find_outages
+from pipeline.recording.outages import Outage, find_outages, turns_about
 from pipeline.recording.readings import SIDES, Held, Reading
 from pipeline.words import format_finding
 
@@ -195,3 +195,15 @@ def test_an_encoder_that_dies_in_pivots_beside_other_drives_is_found() -> None:
     pair = {"left": wheels.first, "right": kill(wheels.second, "zero", start=150.0)}
     (one,) = find_outages(pair, (0.0, 0.0), Reading(), measured(tabulate(drive)), 0.35)
     assert (one.side, one.reads) == ("right", "zero")
+
+
+@pytest.mark.parametrize(
+    ("plan", "pivots"), [([(0.0, one) for one in TURNS], True), ([(1.0, 4.0), (3.0, 4.0)] * 8, False)]
+)
+def test_wheels_stand_throughout_where_the_body_turns_about_them_alone(
+    plan: list[tuple[float, float]], *, pivots: bool
+) -> None:
+    """A body that turns more to one side the faster it goes does not turn about that side."""
+    drive, _ = follow(plan, 0.35, 1.0)
+    assert turns_about("left", measured(tabulate(drive)), 0.35) == pivots
+    assert not turns_about("right", measured(tabulate(drive)), 0.35)
