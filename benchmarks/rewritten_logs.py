@@ -486,6 +486,10 @@ def _die(side: str, reads: float | None, begins: float = 0.6) -> Callable[[Log, 
     return make
 
 
+_ASIDE = 0.5
+"""Motion to the side over that ahead of vehicles that drive to the side."""
+
+
 def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
     """After a part of the log the left wheels stand, and the body turns about them as the right ones drive.
 
@@ -512,8 +516,11 @@ def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
         first, last = log.length
         start = first + begins * (last - first)
         past = times[1:] > start
+        aside = np.diff(y) * np.cos(middle) - np.diff(x) * np.sin(middle)
+        if aside.std() > _ASIDE * ahead.std():
+            return None  # Wheels that roll to the side turn the body about no side.
         ahead, turned = np.where(past, 0.5 * metres * right, ahead), np.where(past, turn * right, turned)
-        aside = np.where(past, 0.0, np.diff(y) * np.cos(middle) - np.diff(x) * np.sin(middle))
+        aside = np.where(past, 0.0, aside)
         headings = yaw[0] + np.cumsum(turned)
         middle = headings - 0.5 * turned
         motions = zip(
