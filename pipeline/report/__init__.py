@@ -322,6 +322,7 @@ def render_catalogue(store: Store) -> str:
             "run": row["run"],
             "link": links.get(str(row["run"]), ""),
             "verdict": verdicts.get(str(row["run"]), ""),
+            "log": shorten(str(row["log"] or ""), LONGEST_TEXT),
             "complete": row["complete"],
             "cells": list(_list_cells(row, numbers)),
         }
