@@ -26,7 +26,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
-            "checksums": ("BATCH_END", "LOG_NOTES", "LOG_STATES"),
+            "checksums": ("LAST_BATCH", "LOG_NOTES", "LOG_STATES"),
             "files": (
                 "hold_lock",
                 "make_folder",
