@@ -143,8 +143,12 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
 
 def _describe_replaced(before: Manifest, now: Manifest) -> str:
     """What made the earlier results others than those that replace them, and where they are kept."""
-    differing = _list_changes(*map(_list_choices, (before, now)))
-    made = [f"made with {differing}"] if differing else []
+    if before.part("log").get("sha256") != now.part("log").get("sha256"):
+        # What else differs may follow from what the log holds.
+        made = ["made of what the log held before it changed"]
+    else:
+        differing = _list_changes(*map(_list_choices, (before, now)))
+        made = [f"made with {differing}"] if differing else []
     parts = {"diagnosis": DIAGNOSIS, "report": REPORT, "summary": SUMMARY}
     lost = [name for name, file in parts.items() if file in before.files and file not in now.files]
     made += [f"with a {enumerate_texts(lost)}, which the new ones lack"] if lost else []
