@@ -168,7 +168,8 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
 
     Returns:
         The logs to work on, the largest first, so that no worker starts it when the others have finished; and
-        the entries of those to skip: done, copies, quarantined, ignored.
+        the entries of those to skip: done, copies, quarantined, ignored; with a time if a batch before this
+        one came to the same.
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
@@ -179,7 +180,7 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
         for path in (*listed.recordings, *odd)
         if (why := find_ignored(listed.name_listed(path), request.options.fleet))
     }
-    settled = [_ignore(path, why, store) for path, why in ignored.items()]
+    settled = [_ignore(path, why, ledger, store) for path, why in ignored.items()]
     paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
     tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
@@ -204,12 +205,19 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
     return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled
 
 
-def _ignore(path: Path, why: str, store: Store) -> Entry:
-    """The entry of a log that a fleet file ignores."""
+def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> Entry:
+    """The entry of a log that a fleet file ignores: that of the batch before, if nothing has changed."""
     log = see_nothing(str(path))
     with suppress(OSError, SlipError):
         log = see_log(path)
     entry = Entry(log=log, fingerprint="", state="ignored", reason=why)
+    before = ledger.get(log.path)
+    if (
+        before is not None
+        and before.log.is_same_file(log)
+        and (before.state, before.reason) == ("ignored", why)
+    ):
+        return before
     Ledger(store).write(entry)
     return entry
 

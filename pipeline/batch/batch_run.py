@@ -319,10 +319,10 @@ def _select(todo: Sequence[Task], shard: Shard | None) -> list[Task]:
 
 def _settle(entry: Entry) -> Line:
     """Line of a log that there is nothing to do for."""
+    line = _make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False)
     if entry.state == "copy":
-        reason = f"the same content as {entry.reason}"
-        return Line(path=entry.log.path, run=entry.reason, state="copy", reason=reason, unchanged=True)
-    return replace(_make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False), unchanged=True)
+        line = replace(line, run=entry.reason, reason=f"the same content as {entry.reason}")
+    return replace(line, unchanged=entry.at > 0.0)
 
 
 def _make_line(entry: Entry, *, is_new: bool) -> Line:

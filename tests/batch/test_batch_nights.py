@@ -20,6 +20,7 @@ from verbs import ask_verb, run_slip
 
 from pipeline.batch.batch_check import read_status
 from pipeline.batch.batch_work import judge_error
+from pipeline.cli.conventions import group_reasons
 from pipeline.core import SlipError
 from pipeline.logs import LogError
 from pipeline.recording import RecordingError
@@ -92,6 +93,23 @@ def test_equal_reasons_are_told_once_with_the_counts_last(field: Path) -> None:
     status = run_slip("results", "status")[1].splitlines()
     assert status[-1].split()[0] == "quarantined"
     assert "  and 16 more (--all lists them)" in status
+
+
+def test_nothing_is_as_before_on_the_first_night(field: Path) -> None:
+    (field / "copy.mcap").write_bytes((field / "a.mcap").read_bytes())
+    (field / "fleet.toml").write_text('ignore = ["text0*"]\n')
+    nights = [run_slip("batch", "field", *INLINE)[1] for _ in range(2)]
+    for state in ("copies", "ignored", "failed"):
+        assert f"{state}, new\n" in nights[0]
+        assert f"{state}, as before\n" in nights[1]
+    assert "as before" not in nights[0]
+    assert ", new" not in nights[1]
+
+
+def test_a_hint_for_several_logs_names_none_of_them() -> None:
+    logs = [(f"{name}.mcap", "no pose", f"List: slip inspect {name}.mcap") for name in "ab"]
+    assert group_reasons(logs[:1]) == [(["a.mcap"], "no pose", "List: slip inspect a.mcap")]
+    assert group_reasons(logs) == [(["a.mcap", "b.mcap"], "no pose", "List: slip inspect LOG")]
 
 
 def test_a_camera_alone_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
