@@ -19,7 +19,7 @@ from pipeline.batch.recordings import Recordings
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
-from pipeline.sources import find_ignored, list_configuration_files, list_presets, read_tables
+from pipeline.sources import list_configuration_files, list_presets, match_ignored, read_tables
 from pipeline.store import (
     LogIdentities,
     Manifest,
@@ -158,7 +158,9 @@ def name_runs(
     return runs, copies
 
 
-def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
+def make_plan(
+    listed: Recordings, store: Store, request: Request
+) -> tuple[list[Task], list[Entry], list[str]]:
     """Compare the logs with the results.
 
     Args:
@@ -169,17 +171,29 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
     Returns:
         The logs to work on, the largest first, so that no worker starts it when the others have finished; and
         the entries of those to skip: done, copies, quarantined, ignored; with a time if a batch before this
-        one came to the same.
+        one came to the same; and what is to be ignored and is not there.
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
     # A pipe or a dead link may be ignored like a log.
     odd = [each.path for each in listed.skipped if each.is_entry]
-    ignored = {
-        path: why
-        for path in (*listed.recordings, *odd)
-        if (why := find_ignored(listed.name_listed(path), request.options.fleet))
+    fleet = request.options.fleet
+    matches = {
+        path: match_ignored(listed.name_listed(path), fleet)
+        for path in (*listed.recordings, *listed.growing, *odd)
     }
+    ignored = {
+        path: _format_rule(*rules[0])
+        for path, matching in matches.items()
+        if path not in listed.growing and (rules := [rule for rule, fits in matching.items() if fits])
+    }
+    used = {rule for matching in matches.values() for rule, fits in matching.items() if fits}
+    # Of the logs of a folder that was not asked for, only some are known.
+    unused = [
+        f"{_format_rule(file, glob)} matched no log"
+        for file, glob in dict.fromkeys(rule for matching in matches.values() for rule in matching)
+        if (file, glob) not in used and (file == fleet or listed.covers(file.parent))
+    ]
     settled = [_ignore(path, why, ledger, store) for path, why in ignored.items()]
     paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
@@ -202,7 +216,11 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
             settled.append(entry)
         elif task.log.path not in done:
             todo.append(replace(task, options=replace(task.options, run=runs.get(task.path, ""))))
-    return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled
+    return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled, unused
+
+
+def _format_rule(file: Path, glob: str) -> str:
+    return f'{file}: ignore = "{glob}"'
 
 
 def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> Entry:

@@ -100,6 +100,7 @@ class Outcome:
         problems: problems other than with logs: of the tables over all runs, or of pruning.
         removed: number of old generations removed.
         notified: what was reported to the command of the user.
+        notes: what the user may have meant otherwise, in sentences.
         stopped: exit code of a batch that a signal stopped; 0 if none did.
     """
 
@@ -108,6 +109,7 @@ class Outcome:
     problems: tuple[SlipError, ...] = ()
     removed: int = 0
     notified: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     stopped: int = 0
 
     @property
@@ -169,7 +171,7 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    planned, settled = make_plan(listed, store, request)
+    planned, settled, notes = make_plan(listed, store, request)
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
     skipped = [each for each in listed.skipped if str(each.path) not in ignored]
     left_out: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
@@ -219,6 +221,7 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         seconds=time.monotonic() - started,
         problems=problems,
         removed=removed,
+        notes=tuple(notes),
         stopped=stopped,
     )
 

@@ -207,6 +207,7 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
+        "notes": list(outcome.notes),
         "notified": list(outcome.notified),
         "errors": [summarize_error(path, error) for path, error in outcome.list_errors()],
     }
@@ -231,6 +232,7 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True, everything: bool
         (line.path, f"earlier results, {line.replaced}", "") for line in outcome.lines if line.replaced
     ]
     lines += explain_logs("replaced", replaced, everything=everything)
+    lines += [*outcome.notes, *([""] if outcome.notes else [])]
     lines += format_counts(outcome.counts, width=6)
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
