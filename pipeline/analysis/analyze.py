@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -117,15 +117,16 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     current = store.manifest(run)
     if current is not None and current.again:
         options = _ask_as_before(options, current)
-    twin = _find_twin(path, sha256, current)
+    twin = _find_twin(path, sha256, current, store)
     if current is not None and not options.force and _is_done(current, keys, options):
-        return Outcome(_read_summary(current, options), current, (), twin)
+        current = store.move_log(current, spell_location(path.resolve())) if twin is None else current
+        return Outcome(_read_summary(current, options), current, (), twin or "")
     done = keys[options.through]
     with store.open_generation(run, hash_json([done, options.through])) as generation:
         previous = generation.previous
         if previous is not None and not options.force and _is_done(previous, keys, options):
             # Another process has written the requested results in the meantime.
-            return Outcome(_read_summary(previous, options), previous, (), twin)
+            return Outcome(_read_summary(previous, options), previous, (), twin or "")
         work = Work(run, setup, options, generation, keys, sha256, progress)
         # Keep no reference, so that the stages can free the columns once the tables exist.
         del setup
@@ -137,13 +138,17 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
             _write_outputs(work, log, options, progress, diagnosis, verdict)
         manifest = generation.commit({**_details(work, log, sha256), "verdict": verdict})
     replaced = "" if previous is None else _describe_replaced(previous, manifest)
-    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin, replaced)
+    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin or "", replaced)
 
 
 def _describe_replaced(before: Manifest, now: Manifest) -> str:
     """What made the earlier results others than those that replace them, and where they are kept."""
-    differing = _list_changes(*map(_list_choices, (before, now)))
-    made = [f"made with {differing}"] if differing else []
+    if before.part("log").get("sha256") != now.part("log").get("sha256"):
+        # What else differs may follow from what the log holds.
+        made = ["made of what the log held before it changed"]
+    else:
+        differing = _list_changes(*map(_list_choices, (before, now)))
+        made = [f"made with {differing}"] if differing else []
     parts = {"diagnosis": DIAGNOSIS, "report": REPORT, "summary": SUMMARY}
     lost = [name for name, file in parts.items() if file in before.files and file not in now.files]
     made += [f"with a {enumerate_texts(lost)}, which the new ones lack"] if lost else []
@@ -202,15 +207,22 @@ def _ask_as_before(options: Options, damaged: Manifest) -> Options:
     )
 
 
-def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
-    """Log of the existing results, if it is another file of the same content and still exists."""
+def _find_twin(path: Path, sha256: str, current: Manifest | None, store: Store) -> str | None:
+    """Log of the existing results, if it is another file of the same content.
+
+    Empty if it is this log or of another content; None if that file is gone or holds something else by now.
+    """
     log = current.part("log") if current is not None else {}
     if log.get("sha256") != sha256:
         return ""
-    with suppress(LogError):
+    try:
         recorded = locate_recorded(str(log.get("path")))
-        return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
-    return ""
+        if recorded == path.resolve():
+            return ""
+        held = LogIdentities(store).lookup(recorded) or hash_log(recorded) if recorded.exists() else None
+    except (LogError, OSError):
+        return ""
+    return str(recorded) if held == sha256 else None
 
 
 def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> str:

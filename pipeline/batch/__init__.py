@@ -18,6 +18,10 @@ class BatchError(SlipError):
     """Logs that cannot be found, or workers that cannot be started."""
 
 
+class Stop(SystemExit):
+    """The batch is stopped by a signal, whose number and 128 are the exit code."""
+
+
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)i?b?\s*", re.IGNORECASE)
 _SHARD = re.compile(r"(\d+)/(\d+)")
 _WORKER_BYTES = 200_000_000

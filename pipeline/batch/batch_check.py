@@ -10,7 +10,7 @@ from pipeline.core import SlipError
 from pipeline.logs import LogError, hash_log, locate_recorded
 from pipeline.report import count_logs, list_noted
 from pipeline.store import (
-    BATCH_END,
+    LAST_BATCH,
     MANIFEST,
     RUNS,
     UPLOADS,
@@ -234,8 +234,10 @@ class Status:
         old_generations: generations that are not current.
         errors: runs that cannot be read, and folders that were not read.
         last: when a batch last worked on a log [s since 1970]; None if none has.
-        ended: when a batch last ended, whether or not it worked on a log [s since 1970]; None if none has.
-        is_idle: whether that batch worked on no log.
+        began: when the last batch began, whether or not it worked on a log [s since 1970]; None without one.
+        ended: when it ended; None if it is still running or was killed.
+        stopped: whether a signal ended it.
+        is_idle: whether it worked on no log.
     """
 
     runs: int
@@ -246,7 +248,9 @@ class Status:
     old_generations: int
     errors: tuple[StoreError, ...]
     last: float | None
+    began: float | None
     ended: float | None
+    stopped: bool
     is_idle: bool
 
 
@@ -266,9 +270,10 @@ def read_status(store: Store) -> Status:
         for note in noted
     )
     size, unread = measure_results(store)
-    folder, name = BATCH_END
-    end = store.notes(folder).read(name) or {}
-    last, began = max((entry.at for entry in entries if entry.at), default=None), end.get("began")
+    folder, name = LAST_BATCH
+    note = store.notes(folder).read(name) or {}
+    began, ended = (time if isinstance(time := note.get(key), float) else None for key in ("began", "at"))
+    last = max((entry.at for entry in entries if entry.at), default=None)
     return Status(
         runs=len(survey.manifests),
         writers=store.list_writers(),
@@ -278,6 +283,8 @@ def read_status(store: Store) -> Status:
         old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),
         last=last,
-        ended=ended if isinstance(ended := end.get("at"), float) else None,
-        is_idle=isinstance(began, float) and (last or 0.0) < began,
+        began=began,
+        ended=ended,
+        stopped=bool(note.get("stopped")),
+        is_idle=began is not None and (last or 0.0) < began,
     )

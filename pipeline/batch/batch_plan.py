@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -19,16 +19,18 @@ from pipeline.batch.recordings import Recordings
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
-from pipeline.sources import find_ignored, list_configuration_files, list_presets, read_tables
+from pipeline.sources import list_configuration_files, list_presets, match_ignored, read_tables
 from pipeline.store import (
     LogIdentities,
     Manifest,
     Store,
     StoreError,
+    add_digits,
     hash_json,
-    name_plainly,
     path_unread,
+    recorded_path,
     see_log,
+    tell_apart,
 )
 from schemas import contract_of, list_contracts
 
@@ -86,70 +88,79 @@ def _fingerprint_program() -> object:
 
 # Names of runs for many logs at once: independent of the order and number of workers.
 #
-# A log keeps its name. Equal content counts once, under the name of the first. Of new logs with the same name
-# the first by path gets the plain name and the others get eight digits of their hash appended.
-
-_DIGITS = 8
+# A content keeps its run, whatever its log is called by now, and counts once, under the name of the first. Of
+# other logs a path keeps its run. New names have as many folders as tell the logs apart.
 
 
 @dataclass(frozen=True)
 class KnownRun:
-    """Run with results: its name, and the hash and size [bytes] of its log."""
+    """Run with results: its name; the hash and size [bytes] of its log, and where that is or was."""
 
     run: str
     sha256: str
     size: int
+    path: Path
 
 
 def name_runs(
     sizes: Mapping[Path, int],
     known: Sequence[KnownRun],
+    others: Collection[Path],
     find_hash: Callable[[Path], str],
     is_present: Callable[[str], bool],
+    name_listed: Callable[[Path], Path],
 ) -> tuple[dict[Path, str], dict[Path, str]]:
-    """Name the runs of new logs.
+    """Name the runs of the logs to work on; no two of them get the same.
 
     Args:
-        sizes: size of every new log [bytes].
+        sizes: size of each log [bytes].
         known: the runs that have results.
-        find_hash: hash of a log, empty if it cannot be read; called where a log may be a copy of another one,
-            by its size, or needs digits of its hash.
+        others: logs of the batch that there is nothing to do for, and that are no copies.
+        find_hash: hash of a log, empty if it cannot be read; called where a log may hold what another one
+            does or did, by its size, or needs digits of its hash.
         is_present: whether the log of a run with results is still there, unchanged and of this batch.
+        name_listed: the path of a log as its folder lists it.
 
     Returns:
-        The run of each log by its path; and of each log that is a copy, the run with the same content.
+        The run of each log by its path, none for one that cannot be read; and of each log that is a copy, the
+        run with the same content.
     """
-    alike = Counter([*sizes.values(), *(run.size for run in known)])
-    alike_named = Counter([*map(name_plainly, sizes), *(run.run for run in known)])
-    hashes = {
-        path: find_hash(path)
-        for path, size in sizes.items()
-        if alike[size] > 1 or alike_named[name_plainly(path)] > 1
-    }
-    holders = {run.sha256: run.run for run in known}
+    alike = Counter(size for _, size in {*sizes.items(), *((each.path, each.size) for each in known)})
+    hashes = {path: find_hash(path) for path, size in sizes.items() if alike[size] > 1}
+    holders = {each.sha256: each for each in known}
+    locations = {each.run: each.path for each in known}
     runs: dict[Path, str] = {}
     copies: dict[Path, str] = {}
+    claimed: set[str] = set()
     for path in sorted(hashes):
-        holder = holders.get(hashes[path])
-        if holder is not None:
+        if (holder := holders.get(hashes[path])) is not None:
             # A log that was moved keeps its run: its results stay valid.
-            is_copy = holder in runs.values() or is_present(holder)
-            (copies if is_copy else runs)[path] = holder
-    taken = {run.run for run in known}
-    first: dict[str, str] = {}
-    for path in sorted(set(sizes) - set(runs) - set(copies)):
-        content, plain = hashes.get(path, ""), name_plainly(path)
-        if content in first:
-            copies[path] = first[content]
+            is_copy = path != holder.path and (holder.run in claimed or is_present(holder.run))
+            (copies if is_copy else runs)[path] = holder.run
+            claimed |= set() if is_copy else {holder.run}
+    kept = {each.path: each.run for each in known if each.run not in claimed}
+    rest = sorted(sizes.keys() - runs.keys() - copies.keys(), key=lambda path: (path not in kept, path))
+    first: dict[str, Path] = {}
+    twins = {path: first.setdefault(hashes.get(path) or str(path), path) for path in rest}
+    locations |= {run: path for path, run in runs.items()}
+    fresh = [path for path in rest if twins[path] == path and path not in kept]
+    names = tell_apart({path: name_listed(path) for path in (*locations.values(), *others, *fresh)})
+    for path in rest:
+        if twins[path] != path:
+            copies[path] = runs[twins[path]]
             continue
-        runs[path] = plain if plain not in taken else f"{plain}-{content[:_DIGITS]}"
-        taken.add(runs[path])
-        if content:
-            first[content] = runs[path]
+        run = kept.get(path) or names[path]
+        if path not in kept and run in locations:
+            content = hashes.get(path) or find_hash(path)
+            run = add_digits(run, content) if content else ""
+        locations[run] = path
+        runs[path] = run
     return runs, copies
 
 
-def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[Task], list[Entry]]:
+def make_plan(
+    listed: Recordings, store: Store, request: Request
+) -> tuple[list[Task], list[Entry], list[str]]:
     """Compare the logs with the results.
 
     Args:
@@ -159,18 +170,31 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
 
     Returns:
         The logs to work on, the largest first, so that no worker starts it when the others have finished; and
-        the entries of those to skip: done, copies, quarantined, ignored.
+        the entries of those to skip: done, copies, quarantined, ignored; with a time if a batch before this
+        one came to the same; and what is to be ignored and is not there.
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
     # A pipe or a dead link may be ignored like a log.
     odd = [each.path for each in listed.skipped if each.is_entry]
-    ignored = {
-        path: why
-        for path in (*listed.recordings, *odd)
-        if (why := find_ignored(listed.name_listed(path), request.options.fleet))
+    fleet = request.options.fleet
+    matches = {
+        path: match_ignored(listed.name_listed(path), fleet)
+        for path in (*listed.recordings, *listed.growing, *odd)
     }
-    settled = [_ignore(path, why, store) for path, why in ignored.items()]
+    ignored = {
+        path: _format_rule(*rules[0])
+        for path, matching in matches.items()
+        if path not in listed.growing and (rules := [rule for rule, fits in matching.items() if fits])
+    }
+    used = {rule for matching in matches.values() for rule, fits in matching.items() if fits}
+    # Of the logs of a folder that was not asked for, only some are known.
+    unused = [
+        f"{_format_rule(file, glob)} matched no log"
+        for file, glob in dict.fromkeys(rule for matching in matches.values() for rule in matching)
+        if (file, glob) not in used and (file == fleet or listed.covers(file.parent))
+    ]
+    settled = [_ignore(path, why, ledger, store) for path, why in ignored.items()]
     paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
     tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
@@ -178,9 +202,8 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
     settled += [
         task.before for task in tasks if task.before and _is_settled(task, manifests, owners, request)
     ]
-    done = {entry.log.path for entry in settled}
-    fresh = [task for task in tasks if task.log.path not in done]
-    runs, copies = _name_tasks(fresh, tasks, manifests, owners, store)
+    done = {entry.log.path: entry.state for entry in settled}
+    runs, copies = _name_tasks(tasks, done, manifests, owners, store, listed)
     todo: list[Task] = []
     for task in tasks:
         if task.path in copies:
@@ -193,15 +216,26 @@ def make_plan(listed: Recordings, store: Store, request: Request) -> tuple[list[
             settled.append(entry)
         elif task.log.path not in done:
             todo.append(replace(task, options=replace(task.options, run=runs.get(task.path, ""))))
-    return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled
+    return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled, unused
 
 
-def _ignore(path: Path, why: str, store: Store) -> Entry:
-    """The entry of a log that a fleet file ignores."""
+def _format_rule(file: Path, glob: str) -> str:
+    return f'{file}: ignore = "{glob}"'
+
+
+def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> Entry:
+    """The entry of a log that a fleet file ignores: that of the batch before, if nothing has changed."""
     log = see_nothing(str(path))
     with suppress(OSError, SlipError):
         log = see_log(path)
     entry = Entry(log=log, fingerprint="", state="ignored", reason=why)
+    before = ledger.get(log.path)
+    if (
+        before is not None
+        and before.log.is_same_file(log)
+        and (before.state, before.reason) == ("ignored", why)
+    ):
+        return before
     Ledger(store).write(entry)
     return entry
 
@@ -254,27 +288,31 @@ def _is_settled(
 
 
 def _name_tasks(
-    todo: Sequence[Task],
     tasks: Sequence[Task],
+    done: Mapping[str, str],
     manifests: Mapping[str, Manifest],
     owners: Mapping[str, str],
     store: Store,
+    listed: Recordings,
 ) -> tuple[dict[Path, str], dict[Path, str]]:
-    """Runs of the logs to work on, and of those that are copies the run of the same content."""
+    """Runs of the logs to work on, and of those that are copies the run of the same content.
+
+    Args:
+        tasks: all logs but the ignored ones.
+        done: states of the logs that there is nothing to do for, by path.
+        manifests: the results by run.
+        owners: path of the log of each run.
+        store: the results.
+        listed: the recordings.
+    """
     identities = LogIdentities(store)
     logs = {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
     paths = {run: str(to_location(str(log.get("path")))) for run, log in logs.items()} | dict(owners)
-    known_runs = {path: run for run, path in paths.items()}
-    known_runs |= {
-        task.log.path: task.before.run
-        for task in tasks
-        if task.before and task.before.run in manifests and task.before.run not in owners
-    }
-    new = {task.path: task.log.size for task in todo if task.log.path not in known_runs}
     locations = {task.log.path: task.path for task in tasks}
     known = [
-        KnownRun(run, str(log.get("sha256")), size)
-        for run, log in logs.items()
+        KnownRun(run, str(log.get("sha256")), size, locations.get(paths[run]) or to_location(paths[run]))
+        # Of the runs that a path had, the last is that of its log.
+        for run, log in sorted(logs.items(), key=lambda item: item[0] in owners)
         if isinstance(size := log.get("bytes"), int)
     ]
 
@@ -293,8 +331,9 @@ def _name_tasks(
         location = locations.get(paths[run])
         return location is not None and find_hash(location) == logs[run].get("sha256")
 
-    named, copies = name_runs(new, known, find_hash, is_present)
-    return named | {task.path: run for task in todo if (run := known_runs.get(task.log.path))}, copies
+    sizes = {task.path: task.log.size for task in tasks if task.log.path not in done}
+    others = [task.path for task in tasks if done.get(task.log.path, "copy") != "copy"]
+    return name_runs(sizes, known, others, find_hash, is_present, listed.name_listed)
 
 
 _NOTES = "batch/pooled"
@@ -302,7 +341,7 @@ _NOTE = "all runs"
 POOLED = ("datasets.parquet", "index.html")
 """Files over all runs."""
 _MOST_ROUNDS = 20
-_VERSION = 2
+_VERSION = 3
 """Version of the pooled files; increase it when their generation changes."""
 
 
@@ -333,7 +372,10 @@ def _hash_runs(store: Store) -> str:
     # The contracts import a table library, which help and usage errors do not need.
     from pipeline.report import list_noted  # noqa: PLC0415
 
-    runs = [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
+    runs = [
+        [manifest.run, manifest.key, manifest.folder.name, recorded_path(manifest)]
+        for manifest in store.survey().manifests
+    ]
     return hash_json([_VERSION, contract_of("datasets").version, runs, list_noted(store)])
 
 

@@ -11,16 +11,19 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from pipeline.batch import BatchError, Request, Shard
+from pipeline.batch import Request, Shard, Stop
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
-from pipeline.batch.recordings import Skipped, find_recordings
+from pipeline.batch.recordings import find_recordings
 from pipeline.core import SlipError, format_count
-from pipeline.store import BATCH_END, JSON, Store
+from pipeline.report import mark_batch
+from pipeline.store import JSON, LAST_BATCH, Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that would affect every other log as well."""
+
+STOPPED = "the batch was stopped"
 
 FAILED_STATES = ("failed", "quarantined", "not_started")
 """States of logs that should have results and have none."""
@@ -97,6 +100,8 @@ class Outcome:
         problems: problems other than with logs: of the tables over all runs, or of pruning.
         removed: number of old generations removed.
         notified: what was reported to the command of the user.
+        notes: what the user may have meant otherwise, in sentences.
+        stopped: exit code of a batch that a signal stopped; 0 if none did.
     """
 
     lines: tuple[Line, ...]
@@ -104,6 +109,8 @@ class Outcome:
     problems: tuple[SlipError, ...] = ()
     removed: int = 0
     notified: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    stopped: int = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -122,7 +129,7 @@ class Outcome:
         errors += [("", problem) for problem in self.problems]
         if waiting:
             what = f"{format_not_started(len(waiting))}: {waiting[0].reason}"
-            hint = "Run the same command again when the cause is removed"
+            hint = "Run the same command again" + ("" if self.stopped else " when the cause is removed")
             errors.append(("", SlipError("not_started", what, hint=hint)))
         return errors
 
@@ -151,46 +158,33 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         BatchError: there are no such logs, or no workers can be started.
         StoreError: the results cannot be written at all.
     """
-    skipped: list[Skipped] = []
-    began = round(time.time(), 3)
-    is_refused = False
-    try:
-        return _run(request, watch, work, skipped)
-    except BatchError:
-        is_refused = True
-        raise
-    finally:
-        if request.targets and not is_refused:
-            _note_end(Store(request.options.out), began, skipped)
-
-
-def _note_end(store: Store, began: float, skipped: Sequence[Skipped]) -> None:
-    """Note that a batch ended, also where all logs were unchanged; a disk without room is told elsewhere."""
-    folder, name = BATCH_END
-    paths: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
-    with suppress(SlipError):
-        if store.root.is_dir():
-            store.notes(folder).write(name, {"began": began, "at": round(time.time(), 3), "left_out": paths})
-
-
-def _run(request: Request, watch: Watch, work: Callable[[Task], Report], skipped: list[Skipped]) -> Outcome:
-    """The batch; `skipped` gets the paths that could not be looked at."""
     started = time.monotonic()
+    try:
+        return _run(request, watch, work, started)
+    except Stop as stop:
+        # The logs were not known yet.
+        return Outcome(lines=(), seconds=time.monotonic() - started, stopped=int(stop.code or 0))
+
+
+def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started: float) -> Outcome:
+    began = round(time.time(), 3)
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    planned, settled = make_plan(listed, store, request)
+    planned, settled, notes = make_plan(listed, store, request)
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
-    skipped += (each for each in listed.skipped if str(each.path) not in ignored)
+    skipped = [each for each in listed.skipped if str(each.path) not in ignored]
+    left_out: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
+    note: dict[str, JSON] = {"began": began, "at": None, "left_out": left_out}
     if request.targets:
-        _note_end(store, time.time(), skipped)
+        _note_batch(store, note)
     todo = _select(planned, request.shard)
     if request.targets:
         watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
     lines = [*map(_settle, settled)]
     waited: dict[str, str] = {}
 
-    def note(report: Report) -> None:
+    def receive(report: Report) -> None:
         path = report.entry.log.path
         if report.holder:
             if path not in waited:
@@ -201,13 +195,23 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], skipped
         lines.append(replace(line, waited_for=waited.get(path, ""), replaced=report.replaced))
         watch.notify(lines[-1], report.entry.log.size)
 
-    remaining = _work_through(todo, request, work, note)
-    problems, removed = _tidy_up(store, request)
-    # Only an error that affects every log leaves some.
-    cause = next((line.reason for line in lines if line.code in STOPPING), "")
+    problems: tuple[SlipError, ...] = ()
+    removed = stopped = 0
+    try:
+        _work_through(todo, request, work, receive)
+        problems, removed = _tidy_up(store, request)
+    except Stop as stop:
+        stopped = int(stop.code or 0)
+    finally:
+        if request.targets:
+            _note_batch(store, note | {"at": round(time.time(), 3), "stopped": bool(stopped)})
+    # Only an error that affects every log, or a signal, leaves some.
+    cause = STOPPED if stopped else next((line.reason for line in lines if line.code in STOPPING), "")
+    known = {line.path for line in lines}
     lines += [
         Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
-        for one in remaining
+        for one in todo
+        if one.log.path not in known
     ]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
@@ -217,15 +221,25 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], skipped
         seconds=time.monotonic() - started,
         problems=problems,
         removed=removed,
+        notes=tuple(notes),
+        stopped=stopped,
     )
 
 
+def _note_batch(store: Store, note: dict[str, JSON]) -> None:
+    """Note that a batch began or ended, also where all logs are unchanged; a full disk is told elsewhere."""
+    folder, name = LAST_BATCH
+    with suppress(SlipError):
+        store.notes(folder).write(name, note)
+        mark_batch(store)
+
+
 def _work_through(
-    todo: Sequence[Task], request: Request, work: Callable[[Task], Report], note: Callable[[Report], None]
-) -> Sequence[Task]:
-    """Process logs, in their order; those that were not started after an error that affects all."""
+    todo: Sequence[Task], request: Request, work: Callable[[Task], Report], receive: Callable[[Report], None]
+) -> None:
+    """Process logs, in their order, up to an error that affects all."""
     if not todo:
-        return ()
+        return
     limits = Limits(request.timeout_s, request.memory_bytes)
     executor = open_executor(request.executor, work, limits, min(request.jobs, len(todo)))
     ledger = Ledger(Store(request.options.out))
@@ -250,15 +264,14 @@ def _work_through(
                         (suspects if executor.spreads_blame else queue).append(task)
                         continue
                 if report.holder:
-                    note(report)
+                    receive(report)
                     time.sleep(_BUSY_PAUSE_S)
                     queue.append(task)
                     continue
                 is_stopped |= report.entry.code in STOPPING
-                note(report)
+                receive(report)
     finally:
         executor.close()
-    return (*queue, *suspects)
 
 
 def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
@@ -309,10 +322,10 @@ def _select(todo: Sequence[Task], shard: Shard | None) -> list[Task]:
 
 def _settle(entry: Entry) -> Line:
     """Line of a log that there is nothing to do for."""
+    line = _make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False)
     if entry.state == "copy":
-        reason = f"the same content as {entry.reason}"
-        return Line(path=entry.log.path, run=entry.reason, state="copy", reason=reason, unchanged=True)
-    return replace(_make_line(replace(entry, seconds=0.0, peak_bytes=0), is_new=False), unchanged=True)
+        line = replace(line, run=entry.reason, reason=f"the same content as {entry.reason}")
+    return replace(line, unchanged=entry.at > 0.0)
 
 
 def _make_line(entry: Entry, *, is_new: bool) -> Line:

@@ -202,12 +202,18 @@ class Recordings:
         growing: recordings that are still being written.
         skipped: skipped paths with reasons: folders that cannot be read, pipes, broken links.
         links: the link by which each path outside of the folders was found.
+        tops: the folders that were searched.
     """
 
     recordings: tuple[Path, ...]
     growing: tuple[Path, ...] = field(default=())
     skipped: tuple[Skipped, ...] = field(default=())
     links: Mapping[Path, Path] = field(default_factory=dict, compare=False)
+    tops: tuple[Path, ...] = field(default=(), compare=False)
+
+    def covers(self, folder: Path) -> bool:
+        """Whether all recordings in a folder and below it were looked for."""
+        return any(folder.resolve().is_relative_to(top) for top in self.tops)
 
     def name_listed(self, path: Path) -> Path:
         """The path of a recording as its folder lists it: by the links that lead to it."""
@@ -247,6 +253,7 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         tuple(sorted(growing - silent)),
         tuple(skipped[path] for path in sorted(skipped)),
         looker.links,
+        tuple(looker.tops),
     )
 
 

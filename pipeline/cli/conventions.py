@@ -22,7 +22,7 @@ from cyclopts.types import PositiveFloat
 from pipeline import store
 from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.batch import parse_memory_limit, parse_size
-from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, measure_memory, name_state, shorten
+from pipeline.core import INPUTS, LONGEST_TEXT, SlipError, group_by, measure_memory, name_state, shorten
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
@@ -149,16 +149,16 @@ _NAMED = 3
 
 
 def group_reasons(logs: Iterable[tuple[str, str, str]]) -> list[tuple[list[str], str, str]]:
-    """Paths of logs by their reason, the most frequent first, with the first hint.
+    """Paths of logs by their reason and hint, the most frequent first; the hint for several says LOG.
 
     Args:
         logs: path, reason and hint of each.
     """
-    groups: dict[str, tuple[list[str], str]] = {}
-    for path, reason, hint in logs:
-        groups.setdefault(reason, ([], hint))[0].append(path)
-    ordered = sorted(groups.items(), key=lambda item: -len(item[1][0]))
-    return [(paths, reason, hint) for reason, (paths, hint) in ordered]
+    groups = group_by(((reason, hint.replace(path, "LOG")), (path, hint)) for path, reason, hint in logs)
+    return [
+        ([path for path, _ in members], reason, hint if len(members) > 1 else members[0][1])
+        for (reason, hint), members in sorted(groups.items(), key=lambda item: -len(item[1]))
+    ]
 
 
 def name_some(paths: Sequence[str], *, everything: bool = False) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, Posi
 from pipeline.batch import (
     Pruning,
     Request,
+    Stop,
     count_cores,
     parse_shard,
     parse_size,
@@ -141,13 +141,19 @@ def batch(  # noqa: D417 - the shared choices document themselves
         return FAILED
     for problem in outcome.problems:
         print_error(problem)
-    outcome = _report(outcome, choices.results, notify)
+    # Whoever stopped it waits for its end, and need not be told.
+    outcome = outcome if outcome.stopped else _report(outcome, choices.results, notify)
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
         print_lines(format_outcome(outcome, is_search=bool(logs), everything=everything))
     if json or quiet:
         _print_failures(outcome)
+    return outcome.stopped or find_code(outcome)
+
+
+def find_code(outcome: Outcome) -> int:
+    """Exit code of a batch that was not stopped."""
     return FAILED if outcome.has_failed else LOSSY if outcome.has_losses else CLEAN
 
 
@@ -157,7 +163,7 @@ def _ending_on_signals() -> Iterator[None]:
 
     def end(number: int, _frame: object) -> None:
         print_note("slip: stopped; the same command continues")
-        sys.exit(128 + number)
+        raise Stop(128 + number)
 
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -197,9 +203,11 @@ def _report(outcome: Outcome, root: Path, notify: str | None) -> Outcome:
 def _as_json(outcome: Outcome) -> dict[str, object]:
     return {
         **outcome.counts,
+        "stopped": bool(outcome.stopped),
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
+        "notes": list(outcome.notes),
         "notified": list(outcome.notified),
         "errors": [summarize_error(path, error) for path, error in outcome.list_errors()],
     }
@@ -224,6 +232,7 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True, everything: bool
         (line.path, f"earlier results, {line.replaced}", "") for line in outcome.lines if line.replaced
     ]
     lines += explain_logs("replaced", replaced, everything=everything)
+    lines += [*outcome.notes, *([""] if outcome.notes else [])]
     lines += format_counts(outcome.counts, width=6)
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")

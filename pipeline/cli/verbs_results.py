@@ -179,7 +179,9 @@ def _as_json(status_now: Status) -> dict[str, object]:
         "bytes": status_now.bytes,
         "old_generations": status_now.old_generations,
         "last": status_now.last,
+        "began": status_now.began,
         "ended": status_now.ended,
+        "stopped": status_now.stopped,
         "writing": [{"run": run, "holder": holder} for run, holder in status_now.writers.items()],
         "logs": [
             {"path": entry.log.path, **{k: v for k, v in asdict(entry).items() if k != "log"}}
@@ -194,7 +196,14 @@ def _format_time(at: float | None) -> str:
 
 
 def _format_status(status_now: Status, *, everything: bool) -> list[str]:
-    last, worked = _format_time(status_now.ended), _format_time(status_now.last)
+    last = _format_time(status_now.ended)
+    if status_now.stopped:
+        last += ", stopped"
+    if status_now.began is not None and status_now.ended is None:
+        began = _format_time(status_now.began)
+        last = f"began {began} and did not end: it is still running, or it was killed"
+    elif status_now.is_idle:
+        last += f" (the last that worked on a log: {_format_time(status_now.last)})"
     old = format_count(status_now.old_generations, "old generation")
     lines: list[str] = []
     for state in EXPLAINED:
@@ -203,7 +212,7 @@ def _format_status(status_now: Status, *, everything: bool) -> list[str]:
     lines += [f"damaged: {error}" for error in status_now.errors]
     lines += [
         f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
-        f"last batch    {last}{f' (the last that worked on a log: {worked})' if status_now.is_idle else ''}",
+        f"last batch    {last}",
         *(f"writing       {run}, by {holder}" for run, holder in status_now.writers.items()),
     ]
     return lines + format_counts(status_now.counts)

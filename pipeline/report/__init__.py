@@ -42,7 +42,7 @@ from pipeline.core import (
 )
 from pipeline.recording import Finding
 from pipeline.store import (
-    BATCH_END,
+    LAST_BATCH,
     LOG_NOTES,
     LOG_STATES,
     MANIFEST,
@@ -322,6 +322,7 @@ def render_catalogue(store: Store) -> str:
             "run": row["run"],
             "link": links.get(str(row["run"]), ""),
             "verdict": verdicts.get(str(row["run"]), ""),
+            "log": shorten(str(row["log"] or ""), LONGEST_TEXT),
             "complete": row["complete"],
             "cells": list(_list_cells(row, numbers)),
         }
@@ -334,6 +335,7 @@ def render_catalogue(store: Store) -> str:
         scripts=[read_own("report/catalogue.js")],
         columns=columns,
         rows=rows,
+        batch=format_batch(store),
         dated=_date_errors(gathered),
         counts=[
             f"{count} {'copy' if (state, count) == ('copy', 1) else name_state(state)}"
@@ -377,7 +379,7 @@ def list_noted(store: Store) -> list[dict[str, str]]:
         if not run or run not in holders:
             holders.add(run)
             noted.append({"path": path, "state": state, "reason": reason, "hint": ""})
-    folder, name = BATCH_END
+    folder, name = LAST_BATCH
     known = {one["path"] for one in noted}
     noted += [
         {"path": str(one["path"]), "state": "left_out", "reason": str(one["reason"]), "hint": ""}
@@ -385,6 +387,41 @@ def list_noted(store: Store) -> list[dict[str, str]]:
         if one.get("path") not in known
     ]
     return sorted(noted, key=lambda one: one["path"])
+
+
+def mark_batch(store: Store) -> None:
+    """Bring what the catalogue says of the last batch up to date, without making the page again.
+
+    Raises:
+        StoreError: the disk reports an error.
+    """
+    told = format_batch(store)
+    store.edit_results_text(
+        CATALOGUE, partial(_BATCH.sub, lambda match: f"{match[1]}{told}{match[2]}", count=1)
+    )
+
+
+def format_batch(store: Store) -> str:
+    """When the last batch began and how it ended, as a sentence; empty where there was none."""
+    folder, name = LAST_BATCH
+    note = store.notes(folder).read(name) or {}
+    began, ended = (_format_moment(note.get(key)) for key in ("began", "at"))
+    if not began:
+        return ""
+    if not ended:
+        return f"The last batch began on {began} and did not end: it is still running, or it was killed."
+    how = "was stopped" if note.get("stopped") else "ended"
+    return f"The last batch began on {began} and {how} on {ended}."
+
+
+def _format_moment(seconds: object) -> str:
+    try:
+        return f"{datetime.fromtimestamp(float(str(seconds)), UTC):%Y-%m-%d %H:%M UTC}"
+    except (ValueError, OverflowError, OSError):
+        return ""
+
+
+_BATCH = re.compile(r'(<p id="batch">).*?(</p>)', re.DOTALL)
 
 
 _GONE = "the log is not there any more; its results are kept"

@@ -68,7 +68,7 @@ else:
                 "convert",
                 "convert_to",
                 "is_model",
-                "find_ignored",
+                "match_ignored",
                 "list_configuration_files",
                 "load_configuration",
                 "merge",

@@ -406,8 +406,8 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
     return layers
 
 
-def find_ignored(log: Path, fleet: Path | None = None) -> str:
-    """Where a fleet file says that a batch ignores a log: `fleet.toml: ignore = "2026/dead*"`; else empty.
+def match_ignored(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str], bool]:
+    """Globs of logs that a batch ignores, with their fleet file, and whether they match a log.
 
     Args:
         log: the recording.
@@ -416,6 +416,7 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
     Raises:
         ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
+    matches: dict[tuple[Path, str], bool] = {}
     # As it is listed: a link in the folder of the fleet file may lead out of it.
     listed = Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
     above = [folder / FLEET_FILE for folder in reversed(listed.parents)]
@@ -432,10 +433,8 @@ def find_ignored(log: Path, fleet: Path | None = None) -> str:
         names = _names_under(path.parent.absolute(), listed) + _names_under(
             path.resolve().parent, _resolve(log)
         )
-        for glob in globs:
-            if any(fnmatch.fnmatchcase(name, glob) for name in names):
-                return f'{path}: ignore = "{glob}"'
-    return ""
+        matches |= {(path, glob): any(fnmatch.fnmatchcase(name, glob) for name in names) for glob in globs}
+    return matches
 
 
 def _names_under(folder: Path, log: Path) -> list[str]:

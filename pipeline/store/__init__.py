@@ -26,7 +26,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
-            "checksums": ("BATCH_END", "LOG_NOTES", "LOG_STATES"),
+            "checksums": ("LAST_BATCH", "LOG_NOTES", "LOG_STATES"),
             "files": (
                 "hold_lock",
                 "make_folder",
@@ -73,13 +73,13 @@ else:
                 "LogIdentities",
                 "LogSighting",
                 "NoRunsError",
+                "add_digits",
                 "find_log",
                 "find_recorded_log",
                 "find_run",
                 "hash_json",
                 "lack_runs",
                 "locate_beside",
-                "name_plainly",
                 "name_run",
                 "read_choices",
                 "read_length_scale",
@@ -87,6 +87,7 @@ else:
                 "see_log",
                 "stored_contexts",
                 "stored_keys",
+                "tell_apart",
             ),
             "verification": (
                 "RUNS",

@@ -262,9 +262,19 @@ class Store:
         Raises:
             StoreError: ``locked``, or the disk refuses.
         """
+        self._edit(manifest, replace(manifest, again=True))
+
+    def move_log(self, manifest: Manifest, path: str) -> Manifest:
+        """The manifest of a run with the path its log has now; failing to write it is no error."""
+        moved = replace(manifest, details={**manifest.details, "log": {**manifest.part("log"), "path": path}})
+        with suppress(StoreError):
+            self._edit(manifest, moved)
+        return moved
+
+    def _edit(self, manifest: Manifest, edited: Manifest) -> None:
         with self._lock(manifest.home), name_disk_errors(manifest.home):
             if load_manifest(manifest.home) == manifest:
-                replace_file(manifest.home / MANIFEST, encode_manifest(replace(manifest, again=True)))
+                replace_file(manifest.home / MANIFEST, encode_manifest(edited))
 
     def remove(self, name: str) -> None:
         """Remove a file that nobody can use any more: a damaged manifest or note.

@@ -13,7 +13,7 @@ from pathlib import Path
 from shlex import quote
 from stat import S_ISDIR
 
-from pipeline.core import SlipError, guess_names, resolve_inside
+from pipeline.core import SlipError, group_by, guess_names, resolve_inside
 from pipeline.logs import RemotePath, list_files, locate_recorded, spell_location, stem_of, to_location
 from pipeline.store.files import hash_bytes
 from pipeline.store.manifests import JSON, Manifest
@@ -23,33 +23,66 @@ from pipeline.store.stored_files import SUMMARY
 from pipeline.store.verification import RUNS
 
 
-def name_plainly(path: Path) -> str:
-    r"""Name of the run of a log unless another run has it: folder/stem.
+def name_plainly(path: Path, folders: int = 1) -> str:
+    r"""Name of the run of a log unless another log has it: folder/stem.
 
     Bytes of a file name that are not UTF-8 are written as ``\xe9``.
+
+    Args:
+        path: absolute path of the log.
+        folders: number of folders in the name, where there are as many.
     """
-    stem = stem_of(path)
-    name = f"{path.parent.name}/{stem}" if path.parent.name else stem
-    return os.fsencode(name).decode("utf-8", "backslashreplace")
+    inside = [part for part in path.parent.parts if part != path.anchor][-folders:]
+    return os.fsencode("/".join([*inside, stem_of(path)])).decode("utf-8", "backslashreplace")
+
+
+def tell_apart(logs: Mapping[Path, Path]) -> dict[Path, str]:
+    """Names of the runs of logs: folder/stem, and before it as many folders as tell a log from the others.
+
+    Logs of one folder and stem keep one name.
+
+    Args:
+        logs: absolute path of each log as its folder lists it, by links perhaps, by its path.
+    """
+    names = {path: name_plainly(path) for path in logs}
+    for folders in range(2, max((len(listed.parts) for listed in logs.values()), default=0)):
+        alike = group_by((name, path) for path, name in names.items())
+        unclear = [
+            path
+            for paths in alike.values()
+            if len({(path.parent, stem_of(path)) for path in paths}) > 1
+            for path in paths
+        ]
+        if not unclear:
+            break
+        names |= {path: name_plainly(logs[path], folders) for path in unclear}
+    return names
+
+
+def add_digits(name: str, sha256: str) -> str:
+    """Name of the run of a log whose name is that of a run with another content."""
+    return f"{name}-{sha256[:_NAME_DIGITS]}"
+
+
+_NAME_DIGITS = 8
 
 
 def name_run(path: Path, sha256: str, store: Store) -> str:
-    """Name of the run of a log: folder/stem, with eight digits of its hash if another run has that name.
+    """Name of the run of a log: of the run of the same content, else of the same path, else a new one.
 
-    Logs of equal content share a run: a copy of a log that has results gets the name of its run.
+    A new one is folder/stem, with more folders before it if that is the name of a log elsewhere, and with
+    eight digits of the hash behind it if it is that of a run all the same.
     """
     absolute = path.resolve()
-    plain = name_plainly(absolute)
-    manifest = store.manifest(plain)
-    if manifest is None:
-        for known in store.survey().manifests:
-            if known.part("log").get("sha256") == sha256:
-                return known.run
-        return plain
-    before = manifest.part("log")
-    if before.get("sha256") == sha256 or before.get("path") == spell_location(absolute):
-        return plain
-    return f"{plain}-{sha256[:8]}"
+    manifests = store.survey().manifests
+    locations = {manifest.run: to_location(recorded_path(manifest)) for manifest in manifests}
+    same = [manifest.run for manifest in manifests if manifest.part("log").get("sha256") == sha256]
+    here = [run for run, location in locations.items() if location == absolute]
+    known = [*(run for run in same if run in here), *same, *here]
+    if known:
+        return known[0]
+    name = tell_apart({log: log for log in (*locations.values(), absolute)})[absolute]
+    return add_digits(name, sha256) if name in locations else name
 
 
 def find_run(text: str, store: Store) -> Manifest:

@@ -12,7 +12,7 @@ import pytest
 from verbs import run_verb
 
 from pipeline.report import _date_errors, render_catalogue
-from pipeline.sources import ConfigurationError, find_ignored
+from pipeline.sources import ConfigurationError, match_ignored
 from pipeline.store import LOG_STATES, Store
 
 STATES = [state for state in LOG_STATES if state != "gone"]
@@ -109,7 +109,7 @@ def test_a_log_that_is_no_longer_ignored_is_read(folder: Path) -> None:
 def test_ignore_is_a_list_of_globs(tmp_path: Path) -> None:
     (tmp_path / "fleet.toml").write_text("ignore = 3\n")
     with pytest.raises(ConfigurationError, match="list of globs"):
-        find_ignored(tmp_path / "a.mcap")
+        match_ignored(tmp_path / "a.mcap")
 
 
 def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> None:
@@ -130,6 +130,22 @@ def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> 
     assert (dated["first"], dated["last"], dated["most"]) == ("2026-05-01", "2026-05-04", "2.00")
     assert [one["x"] for one in dated["points"]] == pytest.approx([0.0, 1 / 3, 1.0])
     assert [one["ideal"] for one in dated["points"]] == pytest.approx([0.25, 0.5, 1.0])
+
+
+def test_a_glob_that_matches_no_log_is_told(folder: Path) -> None:
+    """Of a folder that was searched; of one log nobody knows what else there is."""
+    fleet = folder / "field" / "fleet.toml"
+    fleet.write_text('ignore = ["dead*", "deed*", "*.mcap.part"]\n')
+    words = ("--settle", "0", "--executor", "inline", "--results", "season")
+    told = [f'{fleet}: ignore = "{glob}" matched no log' for glob in ("deed*", "*.mcap.part")]
+    for _ in range(2):
+        answer = json.loads(run_verb("batch", "field", *words, "--json", cwd=folder).stdout)
+        assert answer["notes"] == told
+    assert 'ignore = "deed*" matched no log' in " ".join(
+        run_verb("batch", "field", *words, cwd=folder).stdout.split()
+    )
+    one = json.loads(run_verb("batch", "field/text.mcap", *words, "--json", cwd=folder).stdout)
+    assert one["notes"] == []
 
 
 def test_links_are_ignored_as_they_are_listed(folder: Path) -> None:

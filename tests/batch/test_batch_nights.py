@@ -1,11 +1,15 @@
 """A batch of every night: what it keeps, what it tells and how it ends."""
 
 import hashlib
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,6 +20,7 @@ from verbs import ask_verb, run_slip
 
 from pipeline.batch.batch_check import read_status
 from pipeline.batch.batch_work import judge_error
+from pipeline.cli.conventions import group_reasons
 from pipeline.core import SlipError
 from pipeline.logs import LogError
 from pipeline.recording import RecordingError
@@ -90,6 +95,23 @@ def test_equal_reasons_are_told_once_with_the_counts_last(field: Path) -> None:
     assert "  and 16 more (--all lists them)" in status
 
 
+def test_nothing_is_as_before_on_the_first_night(field: Path) -> None:
+    (field / "copy.mcap").write_bytes((field / "a.mcap").read_bytes())
+    (field / "fleet.toml").write_text('ignore = ["text0*"]\n')
+    nights = [run_slip("batch", "field", *INLINE)[1] for _ in range(2)]
+    for state in ("copies", "ignored", "failed"):
+        assert f"{state}, new\n" in nights[0]
+        assert f"{state}, as before\n" in nights[1]
+    assert "as before" not in nights[0]
+    assert ", new" not in nights[1]
+
+
+def test_a_hint_for_several_logs_names_none_of_them() -> None:
+    logs = [(f"{name}.mcap", "no pose", f"List: slip inspect {name}.mcap") for name in "ab"]
+    assert group_reasons(logs[:1]) == [(["a.mcap"], "no pose", "List: slip inspect a.mcap")]
+    assert group_reasons(logs) == [(["a.mcap", "b.mcap"], "no pose", "List: slip inspect LOG")]
+
+
 def test_a_camera_alone_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with (tmp_path / "camera.mcap").open("wb") as file:
@@ -136,24 +158,68 @@ def test_results_of_a_log_that_is_gone_can_be_removed(field: Path) -> None:
     assert ask_verb("results", "status")["gone"] == 0
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_batch_that_is_stopped_says_so(field: Path, number: int, code: int) -> None:
-    marker = field / "begun"
+@contextmanager
+def working(field: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """A batch at its first log, which takes longer than the test."""
+    marker = field.parent / "begun"
     marker.mkdir()
     environment = os.environ | {"PYTHONPATH": IMPORTABLE, "BEGUN": str(marker), "PAUSE_S": "30"}
     started = (
         "import batch_works, functools, pipeline.batch.batch_run as run, pipeline.cli as cli;"
         "run.run_batch = functools.partial(run.run_batch, work=batch_works.work_slowly);"
-        "cli.main(['batch', 'field', '--executor', 'inline', '--quiet'])"
+        f"cli.main(['batch', 'field', *{INLINE}, *{options}])"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", started], env=environment, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", started],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         while not any(marker.iterdir()):
             time.sleep(0.05)
+        yield process
+        process.kill()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_batch_that_is_stopped_says_what_was_done(field: Path, number: int, code: int) -> None:
+    run_slip("batch", "field/text00.mcap", *INLINE)
+    with working(field, "--json") as process:
         process.send_signal(number)
-        assert process.communicate(timeout=30)[1] == "slip: stopped; the same command continues\n"
-    assert process.returncode == code
+        told, said = process.communicate(timeout=30)
+    assert (said, process.returncode) == ("slip: stopped; the same command continues\n", code)
+    answer = json.loads(told)
+    assert answer["stopped"] is True
+    assert (answer["failed"], answer["not_started"]) == (1, 18)
+    assert answer["errors"][-1]["message"] == "18 logs were not started: the batch was stopped"
+    assert ", stopped" in run_slip("results", "status")[1]
+    assert ask_verb("batch", "field", *INLINE, code=1)["stopped"] is False
+    assert ask_verb("results", "status")["stopped"] is False
+
+
+def test_a_batch_that_is_stopped_in_its_search_says_so(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert field.is_dir()
+    monkeypatch.setattr("pipeline.batch.batch_run.find_recordings", lambda *_, **__: os.kill(os.getpid(), 15))
+    answer = ask_verb("batch", "field", *INLINE, code=143)
+    assert (answer["stopped"], answer["logs"]) == (True, [])
+
+
+def test_a_batch_that_was_killed_did_not_end(field: Path) -> None:
+    run_slip("batch", "field/a.mcap", *INLINE)
+    page = Path("results") / "index.html"
+    assert re.search(
+        r'<p id="batch">The last batch began on .* UTC and ended on .* UTC\.</p>', page.read_text()
+    )
+    with working(field, "--quiet") as process:
+        process.kill()
+    assert re.search(r'<p id="batch">The last batch began on .* UTC and did not end: ', page.read_text())
+    assert "and did not end: it is still running, or it was killed" in run_slip("results", "status")[1]
+    status = ask_verb("results", "status")
+    assert (status["ended"], isinstance(status["began"], float)) == (None, True)
+    run_slip("batch", "field", *INLINE)
+    assert ask_verb("results", "status")["ended"] > status["began"]
+    assert "did not end" not in page.read_text()
 
 
 def test_a_copy_whose_original_is_replaced_gets_its_own_run(originals: Path, tmp_path: Path) -> None:

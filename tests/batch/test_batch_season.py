@@ -17,7 +17,7 @@ from pipeline.analysis.work import VERSIONS
 from pipeline.batch import Pruning, Shard, batch_plan
 from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.batch_run import run_batch
-from pipeline.store import LOG_STATES, Store, list_old
+from pipeline.store import LOG_STATES, Store, find_log, list_old
 
 
 def hash_all(folder: Path) -> dict[str, str]:
@@ -119,10 +119,9 @@ def test_a_new_version_of_a_stage_is_noticed(
 
 def test_a_changed_log_takes_the_place_of_the_old_one(season: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
+    (season / "d.mcap").rename(tmp_path / "new.mcap")
     batch(season, out)
-    shutil.copy(season / "c.mcap", tmp_path / "kept.mcap")
-    (season / "c.mcap").write_bytes((season / "d.mcap").read_bytes())
-    (season / "d.mcap").unlink()
+    (season / "c.mcap").write_bytes((tmp_path / "new.mcap").read_bytes())
     outcome = batch(season, out)
     assert {Path(line.path).stem: (line.state, line.run) for line in outcome.lines}["c"] == (
         "done",
@@ -185,9 +184,31 @@ def test_logs_of_one_name_get_runs_of_their_own(season: Path, tmp_path: Path) ->
     (season / "d.mcap").rename(other / "a.mcap")
     outcome = batch(season, tmp_path / "out")
     runs = [line.run for line in outcome.lines]
-    assert runs[:3] == ["season/a", "season/b", "season/c"]
-    assert runs[3].startswith("season/a-")
+    assert runs == [f"{tmp_path.name}/season/a", "season/b", "season/c", "elsewhere/season/a"]
     assert Store(tmp_path / "out").runs() == tuple(sorted(runs))
+
+
+def test_rotated_logs_keep_their_results(season: Path, tmp_path: Path) -> None:
+    """Each night run.mcap is new, and what was there moves on; nothing is computed twice."""
+    out, field = tmp_path / "out", tmp_path / "field"
+    field.mkdir()
+    runs: dict[str, str] = {}
+    for night, name in enumerate("abc"):
+        for age in range(night, 0, -1):
+            older = f".{age - 1}" if age > 1 else ""
+            (field / f"run{older}.mcap").rename(field / f"run.{age}.mcap")
+        shutil.copy(season / f"{name}.mcap", field / "run.mcap")
+        outcome = batch(field, out)
+        assert counts(outcome) == {"done": 1} | ({"unchanged": night} if night else {})
+        made = {Path(line.path).name: line.run for line in outcome.lines}
+        assert len(set(made.values())) == night + 1
+        for path, run in made.items():
+            sha256 = hashlib.sha256((field / path).read_bytes()).hexdigest()
+            assert runs.setdefault(sha256, run) == run
+    assert verify_results(Store(out), logs=True, notify=print).is_clean
+    assert find_log("field/run", out) == field / "run.2.mcap"
+    page = (out / "index.html").read_text()
+    assert all(f'<p class="path">{field}/{name}.mcap</p>' in page for name in ("run", "run.1", "run.2"))
 
 
 def test_shards_share_the_logs_and_leave_what_one_machine_would(season: Path, tmp_path: Path) -> None:

@@ -77,6 +77,18 @@ def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
     assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]
 
 
+def test_results_of_a_log_that_changed_are_not_said_to_be_of_other_options(
+    field: Path, tmp_path: Path
+) -> None:
+    log = Path(shutil.copytree(field, tmp_path / "field")) / "good.mcap"
+    analyze = ("analyze", log, "--no-report", "--no-diagnosis", "--results", tmp_path / "out")
+    print_verb(*analyze)
+    shutil.copy(log.with_name("truncated.mcap"), log)
+    told = run_verb(*analyze, "--interval", "all").stdout
+    (line,) = [one for one in told.splitlines() if one.startswith("replaced")]
+    assert "earlier results, made of what the log held before it changed; they are kept in" in line
+
+
 def test_results_that_were_made_otherwise_are_not_replaced_without_a_word(
     field: Path, tmp_path: Path
 ) -> None:
