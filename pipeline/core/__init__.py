@@ -49,6 +49,7 @@ from pipeline.core.text import (
     format_errors,
     format_interval,
     format_length,
+    format_line,
     format_part,
     format_recorded,
     format_section,

@@ -1,7 +1,8 @@
 """Texts: errors, numbers with their digits, lengths, durations, shares in words; levels of statistics."""
 
+import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from typing import Any, Literal, TypeVar, get_args
@@ -178,6 +179,17 @@ def format_section(section: str, lines: Iterable[str]) -> str:
         lines: ``key = value`` of each.
     """
     return f"{section} = {{{', '.join(lines)}}}"
+
+
+def format_line(key: str, value: object) -> str:
+    """One line of TOML that gives a key its value."""
+    return f"{key} = {_format_value(value)}"
+
+
+def _format_value(value: object) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(format_line(json.dumps(key), one) for key, one in value.items())}}}"
+    return f"{value:g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
 
 
 def enumerate_texts(texts: Sequence[str]) -> str:
