@@ -16,7 +16,7 @@ from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.findings import Finding, Severity, blame_damage
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.recording.readings import SIDES
-from pipeline.recording.tape import add_lengths, check_lengths, measure_by_tape
+from pipeline.recording.tape import add_lengths, measure_by_tape
 from pipeline.recording.units import JOYSTICK
 from pipeline.run import Alignment
 from pipeline.sources import (
@@ -87,12 +87,12 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     )
     recorded = index.deployment
     require_messages(index)
-    by_tape = measure_by_tape(index, configuration)
     try:
         chosen, configuration = _choose(index, configuration, options)
     except SlipError as error:
-        raise add_lengths(error, by_tape) from None
-    chosen = replace(chosen, findings=(*chosen.findings, *check_lengths(by_tape, chosen)))
+        raise add_lengths(error, measure_by_tape(index, configuration)) from None
+    by_tape = measure_by_tape(index, configuration, chosen)
+    chosen = replace(chosen, findings=(*chosen.findings, *by_tape))
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
     vehicle = chosen.vehicle

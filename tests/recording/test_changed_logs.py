@@ -150,6 +150,24 @@ def test_of_two_faults_both_are_corrected(logs: dict[str, tuple[Path, Log, Answe
     assert choice.recording.configuration.pose.heading_deg == pytest.approx(-90.0)
 
 
+def test_a_tape_is_compared_with_what_is_corrected(
+    logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
+) -> None:
+    path, log, _ = logs["husky_tile"]
+    made = CHANGES["wheels in rpm"].make(log, find_roles(path))
+    assert made is not None
+    told = []
+    for one in (path, write(made, tmp_path / path.name)):
+        options = Options(out=tmp_path, overrides={"truth": {"distance_m": 5.0}})
+        told += [
+            [each.values["value"], each.values["radius_m"]]
+            for each in set_up_log(one, options).choice.findings
+            if each.id == "tape_contradicts_vehicle"
+        ]
+    assert len(told) == 2
+    assert told[0] == pytest.approx(told[1], rel=1e-3)
+
+
 def test_a_unit_that_the_user_gives_is_not_decided_otherwise(
     logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
 ) -> None:
