@@ -386,8 +386,8 @@ def key_stages(
             "log": sha256,
             "run": [run, setup.dataset, setup.terrain],
             "vehicle": msgspec.to_builtins(setup.vehicle),
-            "roles": [plain[role] for role in ("command", "wheels", "pose", "imu", "interval")],
-            "use_intervals": plain["use_intervals"],
+            # All that no later stage has to itself: a new section is forgotten by none.
+            "configuration": {name: part for name, part in plain.items() if name not in {"velocity", "slip"}},
             "limits": pose_limits,
             "message_types": describe_types(one.type_name for one in setup.index.channels),
         },

@@ -181,14 +181,14 @@ def format_section(section: str, lines: Iterable[str]) -> str:
     return f"{section} = {{{', '.join(lines)}}}"
 
 
-def format_key(key: str, value: object) -> str:
+def format_line(key: str, value: object) -> str:
     """`key = value` in a line of TOML: texts, numbers to six digits, lists and tables."""
     return f"{key} = {_format_toml(value)}"
 
 
 def _format_toml(value: object) -> str:
     if isinstance(value, Mapping):
-        return f"{{{', '.join(format_key(json.dumps(key), one) for key, one in value.items())}}}"
+        return f"{{{', '.join(format_line(json.dumps(key), one) for key, one in value.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_format_toml, value))}]"
     return f"{value:g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

@@ -4,13 +4,12 @@ import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
-import msgspec
 import polars as pl
 
-from pipeline.core import NORMAL_95, enumerate_texts, format_key, group_by, mapping_in, name_first
+from pipeline.core import NORMAL_95, enumerate_texts, format_line, group_by, mapping_in, name_first
 from pipeline.recording import SURE, Finding, are_apart
 from pipeline.results import read_finding_table
-from pipeline.sources import Configuration
+from pipeline.sources import AS_RECORDED
 from pipeline.store import JSON, SUMMARY, Manifest, Store, StoreError
 
 _KEY = re.compile(r"(\w+) = ")
@@ -70,11 +69,14 @@ def _read_topic(manifest: Manifest, role: str) -> str:
 
 def _compare_lines(of: str, section: str, keys: Collection[str], manifests: Iterable[Manifest]) -> str:
     """A note on runs with different lines of a section; empty where all are alike."""
-    usual = msgspec.to_builtins(getattr(Configuration(), section))
+    usual = AS_RECORDED[section]
     groups: list[tuple[dict[str, JSON], list[str]]] = []
     for manifest in manifests:
         known = manifest.part("configuration", section)
-        lines = {key: value for key in sorted(keys & known.keys()) if (value := known[key]) != usual.get(key)}
+        given = {key: known[key] for key in sorted(keys & known.keys())}
+        lines: dict[str, JSON] = {
+            key: value for key, value in given.items() if value not in (None, usual.get(key))
+        }
         own = next((runs for other, runs in groups if _are_alike(lines, other)), None)
         if own is None:
             groups.append((lines, [manifest.run]))
@@ -101,7 +103,7 @@ def _are_alike(one: JSON, other: JSON) -> bool:
 
 def _format_lines(lines: Mapping[str, JSON]) -> str:
     """Keys of run.toml with their values."""
-    return enumerate_texts([format_key(key, value) for key, value in lines.items()])
+    return enumerate_texts([format_line(key, value) for key, value in lines.items()])
 
 
 _MOUNTINGS = {

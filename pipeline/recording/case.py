@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import Floats, SlipError
+from pipeline.core import Floats, SlipError, format_line
 from pipeline.recording.evidence import RATES, RIMS, SPEEDS, WHEELS, Axis, Units
 from pipeline.recording.extract import Extraction, Given
 from pipeline.recording.findings import Finding
@@ -18,6 +18,7 @@ from pipeline.recording.motion import CLEAR, NO_MOTION, Motion
 from pipeline.recording.readings import NO_SIGNAL, UNEXPLAINED, Bent, Explained, Held, Reading
 from pipeline.run import Alignment
 from pipeline.sources import (
+    AS_RECORDED,
     CONFIGURED,
     Configuration,
     DriveForm,
@@ -31,18 +32,6 @@ TAKEN_M = 0.1
 """Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
 _AHEAD_S = 0.02
 """Time by which a command is stamped after its recording [s] that is another clock's, and no rounding's."""
-_AS_RECORDED: Mapping[str, Mapping[str, str]] = {
-    "imu": {"unit": 'unit = "rad/s"'},
-    "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0", "unit": 'unit = "m"'},
-    "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
-    "command": {
-        "late_s": "late_s = 0",
-        "unit": 'unit = "m/s"',
-        "yaw_unit": 'yaw_unit = "rad/s"',
-        "steering_unit": 'steering_unit = "rad"',
-    },
-}
-"""Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,32 +325,52 @@ class Case:
         Returns:
             Whether it was applied.
         """
-        default = type(getattr(self.configuration, section))()
-        given = [
-            key
-            for key in change
-            if getattr(getattr(self.configuration, section), key) != getattr(default, key)
-        ]
-        name = "pose_turned" if section == "pose" else f"{section}_corrected"
-        if "up" in change and not given and self.configuration.pose.axes != default.axes:
-            given = ["axes"]
-        wrong = {**values, "kind": "configured", "fault": fault, "given": given, "value": margin}
-        if given and section == "pose":
-            self.findings.append(Finding("pose_contradicted", "warning", section, wrong))
+        as_recorded = {**AS_RECORDED[section]} | ({"unit": usual} if usual else {})
+        wrong = {**values, "fault": fault, "value": margin}
+        if self.contradict(section, wrong, change, as_recorded):
             return False
-        if given:
-            self.findings.append(Finding("signs_contradict", "error", section, wrong))
-            return False
+        wrong |= {"line": line}
         if are_apart(halves):
-            wrong = {**wrong, "line": line, "halves": list(halves)}
+            wrong |= {"halves": list(halves)}
             self.findings.append(Finding("halves_contradict", "warning", section, wrong))
             return False
         self.changes.setdefault(section, {}).update(change)
-        as_recorded = {**_AS_RECORDED[section]} | ({"unit": f'unit = "{usual}"'} if usual else {})
-        settled = [text for key, text in as_recorded.items() if key in change]
-        wrong |= {"kind": "corrected", "line": line, "otherwise": settled}
+        otherwise = [format_line(key, as_recorded[key]) for key in change if key in as_recorded]
+        wrong |= {"kind": "corrected", "otherwise": otherwise[:1]}
+        name = "pose_turned" if section == "pose" else f"{section}_corrected"
         self.findings.append(Finding(name, "warning", section, wrong))
         return True
+
+    def contradict(
+        self,
+        section: str,
+        wrong: Mapping[str, object],
+        keys: Collection[str],
+        as_recorded: Mapping[str, object],
+    ) -> bool:
+        """Tell what contradicts keys of the configuration; what keeps the log as it is recorded is obeyed.
+
+        Args:
+            section: of the configuration.
+            wrong: a fault, a key of `pipeline.words.findings.FAULTS`, with the values of its template.
+            keys: of the section, that would correct it.
+            as_recorded: values of keys that keep it as it is recorded.
+
+        Returns:
+            Whether the user gives one of them.
+        """
+        asked = getattr(self.configuration, section)
+        # Both say which axis points up.
+        keys = ["axes"] if "up" in keys and asked.up is None else keys
+        given = {key: value for key in keys if (value := getattr(asked, key)) is not None}
+        is_as_recorded = all(value == as_recorded.get(key) for key, value in given.items())
+        about = {**wrong, "given": [format_line(key, value) for key, value in given.items()]}
+        if given and is_as_recorded:
+            self.findings.append(Finding("kept_as_recorded", "warning", section, about))
+        elif given:
+            about["kind"] = "configured"
+            self.findings.append(Finding("signs_contradict", "error", section, about))
+        return bool(given)
 
     def complete(self) -> Configuration:
         """The user's configuration with the corrections."""

@@ -348,7 +348,7 @@ def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
 
 def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats:
     scale, offset, unit = convert_unit(section.unit or "rad/s", vehicle.units, where="wheels")
-    return (values - offset) * scale * section.sign / (vehicle.wheel_radius_m if unit == "m/s" else 1.0)
+    return (values - offset) * scale * section.direction / (vehicle.wheel_radius_m if unit == "m/s" else 1.0)
 
 
 def read_signal(
@@ -426,14 +426,14 @@ def read_pair(
         StageError: the drive of this kind of vehicle has other inputs.
     """
     if form is DriveForm.SIDES:
-        left, right = (section.sign * _find_factor(section, side) for side in SIDES)
+        left, right = (section.direction * _find_factor(section, side) for side in SIDES)
         first, second = first * left, second * right
         return read_sides(*((second, first) if section.exchanged else (first, second)), vehicle)
     if form is DriveForm.STEERING:
-        return read_steering(first * section.sign, second, vehicle)
+        return read_steering(first * section.direction, second, vehicle)
     if nominal:
         vehicle = structs.replace(vehicle, controller_track_multiplier=1.0)
-    return read_body(first * section.sign, second, vehicle, sideways)
+    return read_body(first * section.direction, second, vehicle, sideways)
 
 
 def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:

@@ -1,11 +1,11 @@
 """Examination of a log: from the columns of its candidates to a `Recording`, by a list of questions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
 
-from pipeline.core import SlipError
+from pipeline.core import SlipError, format_line
 from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_as_wheels
@@ -154,6 +154,7 @@ QUESTIONS: tuple[Callable[[Case], Case], ...] = (
 
 _READ_AS = (
     "unit", "yaw_unit", "steering_unit", "per_turn", "sign", "reversed", "exchanged", "scale", "factors",
+    "axes", "up", "heading_deg",
 )  # fmt: skip
 """Keys of run.toml that say how the numbers of a signal are read."""
 _ALIKE = 1.3
@@ -164,8 +165,9 @@ def examine(given: Given) -> Recording:
     """Decide which reading of a log's signals makes its body move as it does.
 
     Where something contradicts the log as run.toml reads it, it is examined without each section's keys for
-    units, signs and scales, too, and without all of them. Those without which nothing is contradicted that
-    was not before are wrong, and no radius, gain or wiring is blamed for it.
+    units, signs, scales and frames, too, and without all of them. Those without which nothing is contradicted
+    that was not before, but for what the log itself corrects in their stead, are wrong, and no radius, gain
+    or wiring is blamed for it.
 
     Returns:
         What is in the log; without a pose in it where nothing can stand in for one.
@@ -174,17 +176,54 @@ def examine(given: Given) -> Recording:
     doubts = _list_doubts(recording, given)
     lines = _list_readings(given.configuration) if doubts else {}
     # Each section alone, and then all: who mistakes a unit does so in both.
-    for roles in [*([role] for role in lines), *([[*lines]] if len(lines) > 1 else [])]:
-        sections = {role: getattr(given.configuration, role) for role in roles}
-        plain = {
-            role: msgspec.structs.replace(one, **{key: getattr(type(one)(), key) for key in lines[role]})
-            for role, one in sections.items()
-        }
-        without = msgspec.structs.replace(given.configuration, **plain)
-        if _list_doubts(_examine(replace(given, configuration=without)), given) < doubts:
-            wrong = [Finding("configured_wrongly", "error", role, {"given": lines[role]}) for role in roles]
-            return replace(recording, findings=tuple(wrong))
-    return recording
+    several = [[*lines]] if len(lines) > 1 else []
+    tried = [_try_without(given, roles, lines) for roles in [*([role] for role in lines), *several]]
+    agreeing = [one for one in tried if one.doubts < doubts]
+    agreeing += [one for one in tried if one.doubts - one.corrected < doubts - one.corrected]
+    if not agreeing:
+        return recording
+    return replace(
+        recording,
+        findings=tuple(
+            Finding("configured_wrongly", "error", role, {"given": lines[role], "instead": made})
+            for role, made in agreeing[0].corrections.items()
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A log that is examined without keys of run.toml for some sections.
+
+    Attributes:
+        doubts: what contradicts it.
+        corrections: lines that correct it in place of these keys, by section.
+        corrected: those of the doubts that these are.
+    """
+
+    doubts: set[tuple[str, str]]
+    corrections: dict[str, list[str]]
+    corrected: set[tuple[str, str]]
+
+
+def _try_without(given: Given, roles: Sequence[str], lines: Mapping[str, Mapping[str, object]]) -> _Trial:
+    """The log examined without the keys of some sections."""
+    plain = {
+        role: msgspec.structs.replace(getattr(given.configuration, role), **dict.fromkeys(lines[role]))
+        for role in roles
+    }
+    made = _examine(replace(given, configuration=msgspec.structs.replace(given.configuration, **plain)))
+    corrections: dict[str, list[str]] = {role: [] for role in roles}
+    corrected = set[tuple[str, str]]()
+    for one in made.findings:
+        if one.values.get("kind") != "corrected" or one.where not in corrections:
+            continue
+        # What the user overrules by a line that keeps the log as it is recorded is not in its place.
+        overruled = {format_line(*line) for line in lines[one.where].items()}
+        if overruled.isdisjoint(one.values["otherwise"]):
+            corrections[one.where].append(one.values["line"])
+            corrected.add((one.id, one.where))
+    return _Trial(_list_doubts(made, given), corrections, corrected)
 
 
 def _list_readings(configuration: Configuration) -> dict[str, dict[str, object]]:
@@ -192,10 +231,9 @@ def _list_readings(configuration: Configuration) -> dict[str, dict[str, object]]
     lines = dict[str, dict[str, object]]()
     for role in ("command", "wheels", "pose", "imu"):
         section = getattr(configuration, role)
-        usual = type(section)()
-        keys = [key for key in _READ_AS if getattr(section, key, None) != getattr(usual, key, None)]
-        if keys:
-            lines[role] = {key: getattr(section, key) for key in keys}
+        given = {key: value for key in _READ_AS if (value := getattr(section, key, None)) is not None}
+        if given:
+            lines[role] = given
     return lines
 
 

@@ -13,7 +13,7 @@ from pipeline.recording.clocks import find_pauses
 from pipeline.recording.findings import Finding
 from pipeline.recording.log_choice import Choice, choose, make_stand_in
 from pipeline.recording.log_setup import report_unused, require_messages, require_sources
-from pipeline.recording.tape import check_lengths, measure_by_tape
+from pipeline.recording.tape import measure_by_tape
 from pipeline.sources import (
     UNKNOWN_VEHICLE,
     Configuration,
@@ -117,8 +117,7 @@ def inspect_log(path: Path, options: LogOptions) -> Inspection:
         Finding("repeated_messages", "warning", topic, {"kind": "ignored", "count": count})
         for topic, count in data.repeated.items()
     ]
-    by_tape = measure_by_tape(index, configuration)
-    notes += by_tape if choice is None else check_lengths(by_tape, choice)
+    notes += measure_by_tape(index, configuration, choice)
     duration_s = index.duration_s - sum(lengths_ns) / 1e9
     return Inspection(index, topics, data.losses, tuple(notes), choice, problem, data.unchecked, duration_s)
 

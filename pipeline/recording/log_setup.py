@@ -9,13 +9,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from pipeline.core import SlipError, format_key, format_section
+from pipeline.core import SlipError, format_line, format_section
 from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields, open_log, read_topics
 from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.findings import Finding, Severity, blame_damage
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.recording.readings import SIDES
-from pipeline.recording.tape import add_lengths, check_lengths, measure_by_tape
+from pipeline.recording.tape import add_lengths, measure_by_tape
 from pipeline.recording.units import JOYSTICK
 from pipeline.run import Alignment
 from pipeline.sources import (
@@ -86,12 +86,12 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     )
     recorded = index.deployment
     require_messages(index)
-    by_tape = measure_by_tape(index, configuration)
     try:
         chosen, configuration = _choose(index, configuration, options)
     except SlipError as error:
-        raise add_lengths(error, by_tape) from None
-    chosen = replace(chosen, findings=(*chosen.findings, *check_lengths(by_tape, chosen)))
+        raise add_lengths(error, measure_by_tape(index, configuration)) from None
+    by_tape = measure_by_tape(index, configuration, chosen)
+    chosen = replace(chosen, findings=(*chosen.findings, *by_tape))
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
     vehicle = chosen.vehicle
@@ -321,7 +321,7 @@ def _list_pairs(index: LogIndex, sources: Sources, used: Collection[str]) -> lis
             continue
         role = "command" if COMMANDED.search(topic.lower()) else "wheels"
         topics = [
-            format_key(f"{side}_topic", f"{topic}.{field}[{number}]") for number, side in enumerate(SIDES)
+            format_line(f"{side}_topic", f"{topic}.{field}[{number}]") for number, side in enumerate(SIDES)
         ]
         line = format_section(role, topics)
         what = (
@@ -385,7 +385,7 @@ def _offer(sides: _Sides) -> Finding:
     unit, about = next(
         (of for word, of in _UNITS.items() if re.search(word, sides.left.lower())), ((), _ANY_UNIT)
     )
-    topics = (format_key("left_topic", sides.left), format_key("right_topic", sides.right))
+    topics = (format_line("left_topic", sides.left), format_line("right_topic", sides.right))
     what = (
         f"{sides.left} and {sides.right}, whose meaning is not known; if they are the left and "
         f"right wheels, in run.toml: {format_section(sides.role, (*topics, *unit))}{about}"
@@ -405,7 +405,7 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         if MEASURED.search(topic.lower()):
             continue
         if plain_type(index.types[topic]) == JOYSTICK:
-            axes = [format_key(key, f"{topic}.axes[{one}]") for key, one in _AXES.items()]
+            axes = [format_line(key, f"{topic}.axes[{one}]") for key, one in _AXES.items()]
             what = (
                 f"{topic} (a joystick); if two of its axes are the command, in run.toml: "
                 f"{format_section('command', axes)} (which axes, the set-up of its driver says)"
@@ -418,7 +418,7 @@ def _list_commands(unknown: Mapping[str, Collection[str]], index: LogIndex) -> I
         turns += [("steering_topic", path) for path, end in ends.items() if _STEER.search(end)]
         if speeds and turns:
             key, turn = turns[0]
-            lines = (format_key("speed_topic", f"{topic}.{speeds[0]}"), format_key(key, f"{topic}.{turn}"))
+            lines = (format_line("speed_topic", f"{topic}.{speeds[0]}"), format_line(key, f"{topic}.{turn}"))
             what = (
                 f"{topic} (a speed and a turn), whose meaning is not known; if it is the command, "
                 f"in run.toml: {format_section('command', lines)}"

@@ -47,7 +47,7 @@ def ask_losses(case: Case) -> Case:
         "period_s": period,
     }
     filled = Reading()
-    if not section.interpolate and section.hold_s is None:
+    if section.interpolate is None and section.hold_s is None:
         between = msgspec.structs.replace(section, interpolate=True)
         filled = case.read(command.source, is_measured=False, section=between).fitted(made.motion)
     gain = 0.0
@@ -59,7 +59,7 @@ def ask_losses(case: Case) -> Case:
         values["kind"] = "interpolated"
     elif gain < -NORMAL_95:
         values["kind"] = "held"
-    elif not section.interpolate:
+    elif section.interpolate is None:
         values["kind"] = "undecided"
     case.findings.append(Finding("commands_lost", "warning", "command", values))
     return replace(case, command=command)

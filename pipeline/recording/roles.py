@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core import Floats, format_key
+from pipeline.core import Floats, format_line
 from pipeline.recording.case import NO_CANDIDATE, Candidate, Case
 from pipeline.recording.drive import list_steered
 from pipeline.recording.evidence import ONE_LINE, equal_motion, is_named_measured, rate_command
@@ -124,7 +124,7 @@ def _read_by_motion(case: Case, source: DriveSource) -> Reading:
             sides["left" if made.gains[0] * made.gains[1] < 0.0 else "right"].append(name)
     if not (sides["left"] and sides["right"]):
         return Reading()
-    line = "; ".join(format_key(side, names) for side, names in sides.items())
+    line = "; ".join(format_line(side, names) for side, names in sides.items())
     case.correct("wheels", "sides by motion", {"source": str(source), **sides}, line, dict(sides))
     section = case.complete().wheels
     return case.read(source, is_measured=True, section=section)

@@ -11,7 +11,7 @@ from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reverse
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit, measure_motion, measure_share
 from pipeline.recording.readings import DELAYS_S, Reading
-from pipeline.sources import PoseContent
+from pipeline.sources import AS_RECORDED, PoseContent
 
 _HALF_TURN = 180.0
 _CHANGES: Mapping[str, Mapping[str, object]] = {
@@ -32,14 +32,9 @@ def ask_frame(case: Case) -> Case:
         case.findings.append(Finding("pose_undecided", "warning", "pose", values))
     if not margin:
         return case
-    if section.heading_deg is not None:
-        about = {
-            "kind": "heading",
-            "value": margin,
-            "source": str(source),
-            "offset_deg": turned.offset_deg,
-        }
-        case.findings.append(Finding("pose_contradicted", "warning", "pose", about))
+    about = {"fault": "heading by motion", "source": str(source), "offset_deg": turned.offset_deg}
+    about["value"] = margin
+    if turned.offset_deg and case.contradict("pose", about, ["heading_deg"], AS_RECORDED["pose"]):
         return case
     if turned.flip:
         flipped = {"value": margin, "source": str(source)}

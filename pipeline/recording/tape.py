@@ -1,6 +1,6 @@
 """Lengths of a vehicle by a tape and counted turns, for a log that has no other reference."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from pipeline.recording.extract import Extraction, Given
 from pipeline.recording.findings import Finding
 from pipeline.recording.log_choice import Choice, make_stand_in
 from pipeline.recording.log_columns import LogColumns
-from pipeline.recording.readings import Held
+from pipeline.recording.readings import NO_SIGNAL, Held, Reading
 from pipeline.recording.topic_values import list_wanted
 from pipeline.sources import Configuration, TruthSection, choose_sources
 
@@ -26,39 +26,32 @@ _LEAST_SWING = 0.02
 """Turning back over the range of the heading, below which it is no leg of its own: the noise of a drive."""
 
 
-def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Finding]:
+def measure_by_tape(
+    index: LogIndex, configuration: Configuration, choice: Choice | None = None
+) -> list[Finding]:
     """Wheel radius and track by what the wheels turned, or the commands said, over what a tape and turns say.
 
     Args:
         index: of the log.
         configuration: with the section ``[truth]``.
+        choice: topics of the log and what its motion corrects; None takes topics by their names.
 
     Returns:
-        One finding, or none where nothing was measured by hand, or nothing turned.
+        One finding, or none where nothing was measured by hand, or nothing turned; or that it contradicts the
+        vehicle, where the log or the user names one.
     """
     truth = configuration.truth
     if truth == TruthSection():
         return []
-    vehicle = make_stand_in(index, configuration)
-    sources = choose_sources(index.channels, configuration, vehicle, where=str(index.path))
-    source = sources.wheels or next(iter(sources.rank_drives("wheels")), None) or sources.command
-    if source is None:
-        return []
-    is_measured = source is not sources.command
-    alone = replace(sources, pose=None, wheels=source if is_measured else None, others={})
-    log = LogColumns(read_topics(index, list_wanted(alone, index.types, [source])))
-    given = Given(log, alone, configuration, vehicle, where=str(index.path))
-    case = Case(given, Extraction(given), alone, None)
-    reading = case.read(source, is_measured=is_measured)
+    reading, gyro = _read(index, configuration, choice)
     first, second = _add_up(reading.first, reading.second, reading.form)
     turns, turns_error = truth.turns, _TURNS
-    gyro = case.read_gyro().second
     if turns is None and gyro.moves:
         # A gyro counts turns as well as the eye.
         turns = _count_both_ways(_accumulate(gyro)[1]) / (2.0 * np.pi)
         turns_error = 0.01 * turns
     angle = 2.0 * np.pi * (turns or 0.0)
-    values: dict[str, object] = {"source": str(source), "kind": reading.form}
+    values: dict[str, object] = {"source": reading.name, "kind": reading.form}
     if reading.form == "body":
         if truth.distance_m and first > 0.0:
             values["ahead"] = _bound(truth.distance_m / first, _share(truth.distance_m))
@@ -73,25 +66,45 @@ def measure_by_tape(index: LogIndex, configuration: Configuration) -> list[Findi
             values["track_width_m"] = _bound(radius * second / angle, share + turns_error / (turns or 1.0))
     known = {key: one for key, one in values.items() if isinstance(one, list)}
     values["line"] = "; ".join(f"{key} = {one[0]:.4g}" for key, one in known.items() if key.endswith("_m"))
-    return [Finding("lengths_by_tape", "warning", "vehicle", values)] if known else []
+    if not known:
+        return []
+    return _contradict_vehicle(values, choice) or [Finding("lengths_by_tape", "warning", "vehicle", values)]
 
 
-def check_lengths(by_tape: Sequence[Finding], choice: Choice) -> list[Finding]:
-    """What a tape shows; or that it contradicts the vehicle, where the log or the user names one."""
-    if choice.vehicle_source == "fitted" or choice.vehicle.stand_ins:
-        return list(by_tape)
-    checked = []
-    for one in by_tape:
-        values, known = one.values, choice.vehicle.wheel_radius_m
-        taped = values.get("ahead") or values.get("wheel_radius_m")
-        ratio = taped[0] / (known if values["kind"] == "sides" else 1.0) if isinstance(taped, list) else 1.0
-        if not 1.0 / _FAR < ratio < _FAR:
-            said = {"source": values["source"], "vehicle": choice.vehicle.name, "value": 1.0 / ratio}
-            said |= {"radius_m": known} if values["kind"] == "sides" else {}
-            checked.append(Finding("tape_contradicts_vehicle", "warning", "vehicle", said))
-        else:
-            checked.append(one)
-    return checked
+def _read(index: LogIndex, configuration: Configuration, choice: Choice | None) -> tuple[Reading, Held]:
+    """The wheels of a log, or else its commands, without a vehicle's lengths; and its gyro."""
+    if choice is not None and choice.recording is not None:
+        configuration = choice.recording.configuration
+    vehicle, where = make_stand_in(index, configuration), str(index.path)
+    if choice is None:
+        sources = choose_sources(index.channels, configuration, vehicle, where=where)
+    else:
+        sources = choice.sources
+    stands_in = None if sources.pose is None else sources.pose.wheels
+    source = sources.wheels or stands_in or next(iter(sources.rank_drives("wheels")), None) or sources.command
+    if source is None:
+        return Reading(), NO_SIGNAL
+    is_measured = source is not sources.command
+    alone = replace(sources, pose=None, wheels=source if is_measured else None, others={})
+    log = LogColumns(read_topics(index, list_wanted(alone, index.types, [source])))
+    given = Given(log, alone, configuration, vehicle, where=where)
+    case = Case(given, Extraction(given), alone, None)
+    return case.read(source, is_measured=is_measured), case.read_gyro().second
+
+
+def _contradict_vehicle(values: Mapping[str, object], choice: Choice | None) -> list[Finding]:
+    """That a tape contradicts the vehicle that the log or the user names; else nothing."""
+    taped = values.get("ahead") or values.get("wheel_radius_m")
+    is_known = choice is not None and choice.vehicle_source != "fitted" and not choice.vehicle.stand_ins
+    if choice is None or not is_known or not isinstance(taped, list):
+        return []
+    radius = choice.vehicle.wheel_radius_m
+    ratio = taped[0] / (radius if values["kind"] == "sides" else 1.0)
+    if 1.0 / _FAR < ratio < _FAR:
+        return []
+    said = {"source": values["source"], "vehicle": choice.vehicle.name, "value": 1.0 / ratio}
+    said |= {"radius_m": radius} if values["kind"] == "sides" else {}
+    return [Finding("tape_contradicts_vehicle", "warning", "vehicle", said)]
 
 
 def add_lengths(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:

@@ -36,6 +36,7 @@ else:
                 "is_localization",
             ),
             "configuration": (
+                "AS_RECORDED",
                 "LENGTH_UNITS",
                 "RADII_M",
                 "RANGES",

@@ -341,6 +341,12 @@ class Topics:
             )
         return drives
 
+    def is_measured(self, topic: str, *, steered: bool) -> bool:
+        """Whether a drive is measured by its name, and no command by its type and name."""
+        drives = self.list_drives(commanded=True, steered=steered)
+        commands = {signal.topic for _, source in drives for signal in source.signals}
+        return bool(MEASURED.search(topic.lower())) and topic not in commands
+
     def _single_topics(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
         measured = self.ground_velocities()
         for topic, kind in self.types.items():

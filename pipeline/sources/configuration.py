@@ -176,7 +176,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         yaw_unit: unit of the yaw rate of a body command; by default that of the message type.
         steering_unit: unit of the steering angle; by default that of the message type.
         sign: -1 if forward is recorded as negative.
-        reversed: side that counts backward, by its name.
+        reversed: side that counts backward, by its name; ``none``: neither.
         exchanged: whether left and right are exchanged.
         scale: factor on recorded speeds, where encoders count low or high.
         factors: the same of a side (``left``, ``right``) or of a joint, below zero where it counts backward.
@@ -201,16 +201,21 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     per_turn: Annotated[float, msgspec.Meta(ge=1e-2, le=1e9)] | None = None
     yaw_unit: Literal["rad/s", "deg/s", "mrad/s"] | None = None
     steering_unit: Literal["rad", "deg"] | None = None
-    sign: Literal[1, -1] = 1
-    reversed: Literal["left", "right"] | None = None
-    exchanged: bool = False
+    sign: Literal[1, -1] | None = None
+    reversed: Literal["left", "right", "none"] | None = None
+    exchanged: bool | None = None
     scale: Annotated[float, msgspec.Meta(ge=1e-4, le=1e4)] | None = None
     factors: dict[str, Factor] | None = None
     ignore: list[OutageSection] | None = None
-    interpolate: bool = False
+    interpolate: bool | None = None
     time: Clock | None = None
     late_s: Instant | None = None
     hold_s: Span | None = None
+
+    @property
+    def direction(self) -> int:
+        """Factor on recorded speeds that makes forward positive."""
+        return self.sign or 1
 
 
 LENGTH_UNITS: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -228,7 +233,8 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         yaw_unit: unit of a heading that is one number; by default that with which the body moves along it.
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
-        axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
+        axes: ``enu``: y to the left of x, z up, as by default; ``ned``: y to the right, z down (north, east,
+            down).
         up: axis of the poses' frames that points up, where it is not as ``axes`` says: ``y`` of motion
             capture, ``-y`` of a camera's optical frame.
         heading_deg: angle from the recorded heading to the vehicle's own [degrees], counterclockwise.
@@ -244,7 +250,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     yaw_unit: Literal["rad", "deg"] | None = None
     name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
-    axes: Literal["enu", "ned"] = "enu"
+    axes: Literal["enu", "ned"] | None = None
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
     heading_deg: Annotated[float, msgspec.Meta(ge=-360.0, le=360.0)] | None = None
     unit: Literal["m", "cm", "mm"] | None = None
@@ -316,6 +322,19 @@ class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     slip: SlipSection = SlipSection()
     interval: list[IntervalSection] = []
     use_intervals: Literal["recorded", "all"] = "recorded"
+
+
+_DRIVE_AS_RECORDED: Final[Mapping[str, object]] = {
+    "yaw_unit": "rad/s", "steering_unit": "rad", "sign": 1, "reversed": "none", "exchanged": False,
+    "scale": 1, "factors": {}, "late_s": 0, "time": "header",
+}  # fmt: skip
+AS_RECORDED: Final[Mapping[str, Mapping[str, object]]] = {
+    "command": {**_DRIVE_AS_RECORDED, "unit": "m/s"},
+    "wheels": {**_DRIVE_AS_RECORDED, "unit": "rad/s"},
+    "pose": {"axes": "enu", "up": "z", "heading_deg": 0, "unit": "m"},
+    "imu": {"unit": "rad/s"},
+}
+"""Values by section and key that change nothing of a usual log: written, they keep it as it is recorded."""
 
 
 class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -230,8 +230,9 @@ def load_configuration(
     """The configuration of one log.
 
     Every `fleet.toml` from the root of the file system down to the log's folder is read, nearer ones with
-    priority, then the given fleet file; then `run.toml` or `<log's stem>.toml` beside the log, or the file
-    given instead; then overrides. A model file or a plan of that name is skipped.
+    priority, then the given fleet file; then `run.toml` and `<log's stem>.toml` beside the log and `run.toml`
+    in a log that is a folder, or the file given instead; then overrides. A model file or a plan of that name
+    is skipped.
 
     Args:
         log: the recording.
@@ -262,9 +263,12 @@ def list_configuration_files(
     A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
     may create one in a folder like `/tmp`.
     """
-    folder = _resolve(log).parent
+    path = _resolve(log)
+    beside = [path.parent / RUN_FILE, path.parent / f"{stem_of(log)}.toml"]
+    folder = path if path.is_dir() else path.parent
+    if folder == path:
+        beside.append(folder / RUN_FILE)
     fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
-    beside = [folder / RUN_FILE, folder / f"{stem_of(log)}.toml"]
     files = [
         file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
     ]

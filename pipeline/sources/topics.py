@@ -191,9 +191,10 @@ def choose_sources(
         if channel.topic in misnamed
     ]
     chooser.fix_robot(configuration)
+    command, wheels = chooser.choose_drives(configuration)
     sources = Sources(
-        command=chooser.choose_drive(configuration.command, commanded=True),
-        wheels=chooser.choose_drive(configuration.wheels, commanded=False),
+        command=command,
+        wheels=wheels,
         pose=chooser.choose_track(configuration.pose),
         imu=chooser.choose_imu(configuration.imu.topic),
         interval=chooser.choose_interval(configuration),
@@ -281,14 +282,24 @@ class _Chooser:
         hint = f"Name the field: {signal.topic}.field or {signal.topic}.array[0]."
         raise self._bad(what, hint, "field_needed")
 
-    def choose_drive(self, section: DriveSection, *, commanded: bool) -> DriveSource | None:
-        """Commands (or measured wheels) by configuration, else by type and name."""
-        role = "command" if commanded else "wheels"
-        configured = self._configured_drive(section, role)
-        if configured is not None:
-            return configured
+    def choose_drives(self, configuration: Configuration) -> tuple[DriveSource | None, DriveSource | None]:
+        """Commands and measured wheels by configuration, else by type and name; no signal is both."""
+        command = self._configured_drive(configuration.command, "command")
+        wheels = self._configured_drive(configuration.wheels, "wheels")
+        if command is not None and configuration.command == configuration.wheels:
+            what = f"{command} is configured as command and as wheels"
+            raise self._bad(what, "Take it out of [command] or of [wheels] in run.toml.", "one_of_two_roles")
+        return (
+            command or self._choose_drive(wheels, commanded=True),
+            wheels or self._choose_drive(command, commanded=False),
+        )
+
+    def _choose_drive(self, other: DriveSource | None, *, commanded: bool) -> DriveSource | None:
+        """Commands (or measured wheels) by type and name, without what is configured as the other."""
         usual = self.vehicle.topics.command if commanded else self.vehicle.topics.wheels
-        return self._best(self._own().list_drives(commanded=commanded, steered=self._steered), usual, role)
+        drives = self._own().list_drives(commanded=commanded, steered=self._steered)
+        drives = [one for one in drives if other is None or one[1].signals != other.signals]
+        return self._best(drives, usual, "command" if commanded else "wheels")
 
     def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
         reason = CONFIGURED
@@ -313,8 +324,24 @@ class _Chooser:
             if not drives or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
                 what = f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone"
                 raise self._bad(what, f"Give {role}.left_topic and {role}.right_topic with field paths.")
+            if role == "command" and topics.is_measured(signal.topic, steered=self._steered):
+                raise self._not_commanded(signal.topic)
             return DriveSource(drives[0].form, drives[0].signals, reason, drives[0].name)
         return None
+
+    def _not_commanded(self, topic: str) -> ConfigurationError:
+        """The error of measurements that are configured as the command."""
+        kind = self.types[topic]
+        what = f"the topic {topic!r} ({kind}), configured as command, holds what the wheels measured"
+        drives = self._own().list_drives(commanded=True, steered=self._steered)
+        known = name_first(list(dict.fromkeys(str(source) for _, source in drives)))
+        hint = (
+            f"Commands are in {known}. Take {topic} out of [command] in run.toml"
+            if known
+            else f"No topic of this log holds commands. Take {topic} out of [command] in run.toml: measured "
+            "wheels alone, without commands, can be analyzed"
+        )
+        return self._bad(what, f"{hint}.", "command_is_measured")
 
     def _require_whole(self, section: DriveSection, role: str) -> None:
         """Refuse one of several keys that are used only together."""

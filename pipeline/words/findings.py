@@ -11,8 +11,8 @@ from pipeline.core import (
     format_count,
     format_duration,
     format_errors,
-    format_key,
     format_length,
+    format_line,
     format_share,
     name_first,
     suffix_unit,
@@ -953,6 +953,8 @@ FAULTS: Mapping[str, Template] = {
     "other topics do not: its clock runs ahead",
     "axis up": _axis_up,
     "heading off": _heading_off,
+    "heading by motion": "by the motion the heading of {source} is {offset_deg:.0f} degrees off (or as much "
+    "less half a turn)",
     "looks to the rear": _looks_to_the_rear,
     "late stamps": _late_stamps,
     "gyro in degrees": "the gyro of {gyro} is in degrees per second",
@@ -970,16 +972,18 @@ def _corrected(of: Values) -> str:
     return f"{fault}: corrected, as {of['line']} under [{of['where']}] in run.toml does{otherwise}"
 
 
-def _configured(of: Values) -> str:
-    fault, given = _fill(FAULTS[of["fault"]], of), ", ".join(of["given"])
-    return f"{fault}, but [{of['where']}] in run.toml gives {given}: correct it"
+def _configured(of: Values, rest: str) -> str:
+    fault, given = _fill(FAULTS[of["fault"]], of), enumerate_texts(of["given"])
+    return f"{fault}, but [{of['where']}] in run.toml gives {given}{rest}"
 
 
 def _configured_wrongly(of: Values) -> str:
-    given = [key if isinstance(value, dict) else format_key(key, value) for key, value in of["given"].items()]
+    given = [format_line(key, value) for key, value in of["given"].items()]
+    instead = of.get("instead")
+    agree = f"{enumerate_texts(instead)} is found, and they agree" if instead else "they agree"
     return (
         f"[{of['where']}] in run.toml (or in a fleet.toml above it) gives {enumerate_texts(given)}, which "
-        "contradicts the other signals; without it they agree: take it out"
+        f"contradicts the other signals; without it {agree}: take it out"
     )
 
 
@@ -990,11 +994,6 @@ def _contradicted(of: Values) -> str:
         f"one half the motion is {one:.3g} times the signal, in the other {other:.3g} times. Not corrected "
         f"({of['line']} under [{of['where']}] in run.toml takes it so)"
     )
-
-
-def _pose_configured(of: Values) -> str:
-    fault, given = _fill(FAULTS[of["fault"]], of), ", ".join(of["given"])
-    return f"{fault}, but [pose] in run.toml gives {given}, which is taken as it is given"
 
 
 def _unit_undecided(of: Values) -> str:
@@ -1239,7 +1238,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     },
     "configured_wrongly": _configured_wrongly,
     "signs_contradict": {
-        "configured": _configured,
+        "configured": partial(_configured, rest=": correct it"),
         "command and wheels": _command_against_wheels,
         "signal and poses": _signal_against_poses,
     },
@@ -1264,11 +1263,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         'clearly: z is taken to point up, as usual (up = "{axis}", or "-{axis}", under [pose] in run.toml '
         'takes another axis, up = "z" settles it)',
     },
-    "pose_contradicted": {
-        "configured": _pose_configured,
-        "heading": "by the motion the heading of {source} is {offset_deg:.0f} degrees off (or as much less "
-        "half a turn), but [pose] in run.toml gives heading_deg, which is taken as it is given",
-    },
+    "kept_as_recorded": partial(_configured, rest=", and it is taken as it is recorded"),
     "pose_flipped": "the headings of {source} turn against its own path: its frame is of the other hand; "
     "correct what publishes it",
     "command_of_map": "the commands of {source} are along the axes of a map, and the base turns them by its "

@@ -84,6 +84,7 @@ def test_a_report_of_another_version_is_drawn_again_from_the_same_tables(
         ({"velocity": {"window_s": 0.5}}, ("velocity", "slip", "aggregate")),
         ({"vehicle": {"track_width_m": 0.6}}, STAGES),
         ({"run": {"terrain": "parquet"}}, STAGES),
+        ({"truth": {"distance_m": 2.0, "turns": 10.0}}, STAGES),
     ],
 )
 def test_a_change_redoes_exactly_what_depends_on_it(

@@ -35,6 +35,9 @@ def find_what_is_told(tmp_path: Path, section: str, line: str, count: int = 1) -
         ("wheels", 'unit = "m/s"'),
         ("wheels", "sign = -1"),
         ("pose", 'unit = "mm"'),
+        ("pose", "heading_deg = 90"),
+        ("pose", 'axes = "ned"'),
+        ("pose", 'up = "-y"'),
         ("imu", 'unit = "deg/s"'),
     ],
 )

@@ -16,6 +16,7 @@ from simulated_platforms import simulate_platform
 
 from pipeline.analysis import Options
 from pipeline.recording.log_setup import set_up_log
+from pipeline.sources import load_configuration
 from pipeline.words import format_finding
 
 ROOT = Path(__file__).parents[2]
@@ -105,6 +106,40 @@ def test_the_line_that_is_offered_settles_it(
         assert roles >= {"command", "wheels"}
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    few(
+        [
+            ("husky_tile", "both encoders backward"),
+            ("husky_tile", "right wheels reversed"),
+            ("husky_tile", "sides exchanged"),
+            ("husky_tile", "left encoder counts double"),
+            ("husky_tile", "poses turned by 90 degrees"),
+            ("husky_tile", "wheels in rpm"),
+            ("turtlebot4", "yaw rate in degrees"),
+        ],
+        3,
+    ),
+)
+def test_the_line_that_takes_them_as_recorded_is_obeyed(
+    logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, tmp_path: Path
+) -> None:
+    path, log, _ = logs[name]
+    made = CHANGES[change].make(log, find_roles(path))
+    assert made is not None
+    changed = write(made, tmp_path / path.name)
+    first = set_up_log(changed, Options(out=tmp_path)).choice.findings
+    (told,) = [one for one in first if one.values.get("kind") == "corrected"]
+    (line,) = told.values["otherwise"]
+    assert f"{line} takes them as recorded" in format_finding(told)
+    (tmp_path / "line.toml").write_text(f"[{told.where}]\n{line}")
+    options = Options(out=tmp_path, config=tmp_path / "line.toml")
+    kept = set_up_log(changed, options).choice
+    assert not [one for one in kept.findings if one.values.get("kind") == "corrected"]
+    assert not [format_finding(one) for one in kept.findings if one.severity == "error"]
+    assert kept.recording.configuration == load_configuration(changed, given=options.config)
+
+
 def test_of_two_faults_both_are_corrected(logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path) -> None:
     path, log, _ = logs["husky_tile"]
     roles = find_roles(path)
@@ -115,6 +150,24 @@ def test_of_two_faults_both_are_corrected(logs: dict[str, tuple[Path, Log, Answe
     choice = set_up_log(write(log, tmp_path / path.name), Options(out=tmp_path)).choice
     assert choice.recording.configuration.wheels.reversed == "right"
     assert choice.recording.configuration.pose.heading_deg == pytest.approx(-90.0)
+
+
+def test_a_tape_is_compared_with_what_is_corrected(
+    logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
+) -> None:
+    path, log, _ = logs["husky_tile"]
+    made = CHANGES["wheels in rpm"].make(log, find_roles(path))
+    assert made is not None
+    told = []
+    for one in (path, write(made, tmp_path / path.name)):
+        options = Options(out=tmp_path, overrides={"truth": {"distance_m": 5.0}})
+        told += [
+            [each.values["value"], each.values["radius_m"]]
+            for each in set_up_log(one, options).choice.findings
+            if each.id == "tape_contradicts_vehicle"
+        ]
+    assert len(told) == 2
+    assert told[0] == pytest.approx(told[1], rel=1e-3)
 
 
 def test_a_unit_that_the_user_gives_is_not_decided_otherwise(

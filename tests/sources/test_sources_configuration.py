@@ -74,6 +74,16 @@ def test_a_file_named_like_the_log_speaks_of_it_alone(log: Path, write: Write) -
     assert load_configuration(other).run.terrain == "all"
 
 
+def test_a_recording_that_is_a_folder_has_its_configuration_beside_it_or_in_it(write: Write) -> None:
+    folder = write("2026/bag/metadata.yaml", "").parent
+    write("2026/run.toml", '[run]\nterrain = "beside"\ndataset = "beside"\n')
+    found = load_configuration(folder)
+    assert (found.run.terrain, found.run.dataset) == ("beside", "beside")
+    write("2026/bag/run.toml", '[run]\nterrain = "inside"\n')
+    found = load_configuration(folder)
+    assert (found.run.terrain, found.run.dataset) == ("inside", "beside")
+
+
 def test_a_given_file_stands_in_for_the_one_beside_the_log(log: Path, write: Write) -> None:
     write("2026/monday/run.toml", '[run]\nterrain = "beside"\ndataset = "beside"\n')
     given_file = write("elsewhere/my.toml", '[run]\nterrain = "given"\n')

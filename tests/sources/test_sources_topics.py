@@ -305,6 +305,16 @@ def test_a_calib_state_topic_is_applied_by_default_and_can_be_turned_off() -> No
         ({"command": {"speed_topic": "/joint_states.velocity[0]"}}, "field_needed", ["yaw_rate"]),
         ({"command": {"yaw_rate_topic": "/joint_states.velocity[0]"}}, "field_needed", ["speed_topic"]),
         ({"command": {"left_topic": "/nothing.x"}}, "field_needed", ["left_topic", "command.right_topic"]),
+        (
+            {"command": {"topic": "/joint_states"}},
+            "command_is_measured",
+            ["measured", "No topic", "[command]"],
+        ),
+        (
+            {"command": {"topic": "/arm/joints"}, "wheels": {"topic": "/arm/joints"}},
+            "one_of_two_roles",
+            ["/arm/joints", "[command]", "[wheels]"],
+        ),
         ({"wheels": {"left": ["front_left"]}}, "field_needed", ["wheels.left", "wheels.right"]),
         ({"pose": {"frames": ["map", "base_link"]}}, "topic_not_found", ["transforms", "pose.topic"]),
         ({"interval": [{"topic": "/joint_states"}]}, "type_not_usable", ["interval", "String"]),
@@ -319,11 +329,24 @@ def test_a_choice_that_cannot_be_followed_is_one_clear_line(
     configuration: dict[str, object], code: str, words: list[str]
 ) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        choose({"/joint_states": JOINTS, **ICP}, configuration=configuration)
+        choose({"/joint_states": JOINTS, "/arm/joints": JOINTS, **ICP}, configuration=configuration)
     said = str(caught.value)
     assert caught.value.code == code
     assert "\n" not in said
     assert [word for word in words if word not in said] == []
+
+
+def test_measurements_that_are_configured_as_command_name_the_commands() -> None:
+    with pytest.raises(ConfigurationError, match=r"Commands are in /cmd_vel\. Take /joint_states out"):
+        choose(
+            {"/joint_states": JOINTS, "/cmd_vel": TWIST, **ICP},
+            configuration={"command": {"topic": "/joint_states"}},
+        )
+
+
+def test_a_topic_that_is_configured_for_one_role_has_no_other() -> None:
+    chosen = choose({"/joints": JOINTS, **ICP}, configuration={"command": {"topic": "/joints"}})
+    assert (str(chosen.command), chosen.wheels) == ("/joints", None)
 
 
 @pytest.mark.parametrize(
