@@ -19,7 +19,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
+from pipeline.core import (
+    INPUT_WORDS,
+    NORMAL_95,
+    PACKAGE,
+    guess_names,
+    make_plain,
+    read_bounded_text,
+    read_version,
+    suffix_unit,
+)
 from pipeline.models import (
     LEAST_DELAY_S,
     UNDECIDED,
@@ -200,7 +209,7 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
     head = [
         f"{quote_name(facts.vehicle.name)}: {target.about}.",
         f"Names: {target.source}.",
-        facts.format_fit(),
+        *facts.list_origin(),
         facts.vehicle.format_unknown(),
         "What depends on a value in doubt is commented out." if doubtful else "",
     ]
@@ -260,6 +269,8 @@ def require_plausible(label: str, *values: float, least: float = -LARGEST) -> No
 
 
 _FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
+_DIGEST = 12
+"""Digits of a recording's hash that tell it from all others."""
 _MOST_GROUNDS = 5
 """Values by ground that a comment lists; of more it has the least and the largest."""
 _LINE = 100
@@ -581,12 +592,25 @@ class Facts:
         rows = self.file.list_fitted("runs")
         return [value for row in rows if isinstance(value := row.get(key), float)]
 
-    def format_fit(self) -> str:
-        """Data that the model was fitted to; empty before a fit."""
-        names = [quote_name(str(run.get("run"))) for run in self.file.list_fitted("runs")]
+    def list_origin(self) -> list[str]:
+        """What the values come from: the version that writes them, and the runs of a fit."""
+        names = []
+        for run in self.file.list_fitted("runs"):
+            digest = str(run.get("sha256") or "")[:_DIGEST]
+            names.append(f"{quote_name(str(run.get('run')))}{digest and f' (SHA-256 {digest})'}")
         source = str(self.file.fit.get("input"))
         words = INPUT_WORDS.get(source) or quote_name(source)
-        return f"Fitted {words} of {', '.join(names)}." if names else ""
+        fitted = [f"Fitted {words} of {', '.join(names)}."] if names else []
+        return [f"Written by {PACKAGE} {read_version()}.", *fitted]
+
+    def list_sources(self) -> list[str]:
+        """All parameters that act, with their intervals and doubts."""
+        return [
+            self._format_source(effect, parameter)
+            for effect in self.file.model
+            for parameter in effect.parameters
+            if effect.is_used(parameter)
+        ]
 
     def _spin(self, quantity: Quantity) -> Amount:
         return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))

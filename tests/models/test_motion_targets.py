@@ -13,6 +13,7 @@ from target_schemas import SCHEMAS
 from verbs import run_verb
 
 from pipeline import export
+from pipeline.core import PACKAGE, read_version
 from pipeline.export import Facts, export_model, list_targets
 from pipeline.export.spread import find_response
 from pipeline.models import Effect, find_effect, format_model, list_effects
@@ -230,6 +231,20 @@ def test_an_expected_range_that_is_assumed_is_said_to_be() -> None:
         number = told["parameters"][parameter.name]
         assert number["is_spread_measured"] == (not said)
         assert number["another_run"]["low"] < 0.98 * value < 1.02 * value < number["another_run"]["high"]
+
+
+@pytest.mark.parametrize("name", sorted({target.name for target in list_targets()} - {"json"}))
+def test_every_text_says_which_version_and_recording_its_values_come_from(name: str) -> None:
+    (run,) = FIT["runs"]  # type: ignore[misc]
+    fit = {**FIT, "runs": [{**run, "sha256": "8be38fc23b7a246891"}]}  # type: ignore[misc]
+    vehicle = F1TENTH if name in {"autoware", "vesc"} else HUSKY
+    ends = {"drive_lag.tau": (0.2, 0.4)}
+    text = export_model(
+        make(find_effect("drive_lag")(tau=0.3), vehicle=vehicle, fit=fit, intervals=ends), name
+    )
+    assert f"Written by {PACKAGE} {read_version()}." in text
+    assert "Fitted from wheel encoders of 'yard/monday' (SHA-256 8be38fc23b7a)." in text
+    assert "drive_lag.tau = 0.3 s (this run, 95 %: 0.2 to 0.4; another run: " in text
 
 
 def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be() -> None:
