@@ -87,7 +87,7 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Number]:
     """Pose delay from a run's gyro, with the error of the gyro fit; fits of the motion do not change it.
 
     Its interval is that of the mean delay of the run. Delays of single poses vary about it, each for some
-    seconds, so that every stretch of ten seconds tells one. Half a gyro sample is part of it, since a stamp may
+    seconds, so that every stretch of ten seconds tells one. Half a gyro sample is part of it: a stamp may
     mark the beginning or the end of a sample. Where poses are repeated until the next one is computed, a pose
     may be as old as the time between two of them when it is first published.
     """
