@@ -232,7 +232,7 @@ class Datasets(Table):
     relative_slip = optional("1", "median slip modulus over ideal speed, while it moves")
     slip_energy = optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
     lost_energy = optional("1", "slip path over path driven: energy lost per metre and mass, over mu g")
-    unpredictability = optional("m/s", "held-out RMS slip of a fitted slip model")
+    unpredictability = optional("m/s", "held-out RMS residual of a fitted slip model")
     relative_unpredictability = optional("1", "unpredictability over RMS ideal speed")
     transitory_slip = optional("m", "slip path a change of command adds to the steady one")
     keys = text("run/generation of every run counted, separated by spaces")
@@ -373,7 +373,7 @@ class Features(Table):
     relative_slip = _feature("1", "median slip modulus over ideal speed, while it moves", 0.0, 1e6)
     slip_energy = _feature("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2", 0.0, 1e12)
     lost_energy = _feature("1", "slip path over path driven: energy per metre and mass over mu g", 0.0, 1e9)
-    unpredictability = _feature("m/s", "held-out RMS slip of a fitted slip model", 0.0, 1e3)
+    unpredictability = _feature("m/s", "held-out RMS residual of a fitted slip model", 0.0, 1e3)
     relative_unpredictability = _feature("1", "unpredictability over RMS ideal speed", 0.0, 1e6)
     transitory_slip = _feature("m", "slip path a change of command adds to the steady one", -1e6, 1e6)
 

@@ -28,7 +28,7 @@ from pipeline.datasets.levels import LEVEL, adjust, fit_levels
 from pipeline.datasets.pairs import BLOCKS, RUNS
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.models import list_effects, name_effect
-from pipeline.results import CAUSE_NAMES
+from pipeline.results import BUDGET_SLIP, CAUSE_NAMES
 from pipeline.store import NoRunsError, Store, lack_runs
 
 _LEAST_SHOWN = 0.05
@@ -65,7 +65,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class CauseDifference:
-    """Difference of the RMS slip of ``b``, which has more, and ``a`` [m/s], by cause, the largest first."""
+    """Difference of `BUDGET_SLIP` of ``b``, which has more, and ``a`` [m/s], by cause, the largest first."""
 
     a: str
     b: str
@@ -84,7 +84,7 @@ class CauseDifference:
         judged = [part for part in self.parts if part.p_adjusted is not None]
         sure = [names.get(one.name, one.name) for one in judged if (one.p_adjusted or 0.0) <= LEVEL]
         end = f"significant: {', '.join(sure) or 'none'}" if judged else "too few runs for a test"
-        whole = f"{self.b} has {format_two(self.total)} m/s more RMS slip than {self.a}"
+        whole = f"{self.b} has {format_two(self.total)} m/s more {BUDGET_SLIP} than {self.a}"
         return f"{whole}; by cause in m/s: {', '.join(texts) or 'none'}; {end}"
 
 

@@ -304,7 +304,7 @@ MEASURES = {
         "relative_unpredictability",
         "unpredictability",
         "1",
-        "held-out RMS slip of a fitted slip model over the RMS ideal speed",
+        "held-out RMS residual of a fitted slip model over the RMS ideal speed",
     ),
     "transitory": Measure(
         "transitory_slip",

@@ -11,6 +11,7 @@ import numpy as np
 from msgspec.structs import replace as replace_fields
 
 from pipeline.core import NORMAL_95
+from pipeline.core.arrays import number_stretches
 from pipeline.estimation.driving_need import measure_driven
 from pipeline.estimation.fit import PathFit, find_unlearned, invert
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_path
@@ -85,17 +86,19 @@ def list_first_run(state: ModelState, estimates: Estimates) -> dict[str, dict[st
 def read_clock(effect: Effect, run: MotionRun) -> dict[str, Number]:
     """Pose delay from a run's gyro, with the error of the gyro fit; fits of the motion do not change it.
 
-    Its interval includes the variation of the delay in a run and half a gyro sample, since a stamp may mark
-    the beginning or the end of a sample. Where poses are repeated until the next one is computed, a pose may
-    be as old as the time between two of them when it is first published.
+    Its interval is that of the mean delay of the run. Delays of single poses vary about it, each for some
+    seconds, so that every stretch of ten seconds tells one. Half a gyro sample is part of it: a stamp may
+    mark the beginning or the end of a sample. Where poses are repeated until the next one is computed, a pose
+    may be as old as the time between two of them when it is first published.
     """
     (parameter,) = effect.parameters
     value = effect.values[parameter.name]
     half = math.nan
     if run.gyro_fit is not None and run.gyro is not None:
         sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / NORMAL_95
-        spread = run.alignment.latency_spread_s
-        half = NORMAL_95 * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
+        stretches = np.unique(number_stretches(run.track.times - run.track.times[0])).size
+        varying = run.alignment.latency_spread_s / math.sqrt(stretches)
+        half = NORMAL_95 * math.sqrt(run.gyro_fit.delay_error_s**2 + varying**2 + sampling**2)
     number = Number(value, value - half - run.repeats_s, value + half, parameter.unit)
     there, is_measured = expect_another_run(parameter, number), parameter.between_runs is not None
     return {parameter.name: replace_fields(number, another_run=there, is_spread_measured=is_measured)}

@@ -19,7 +19,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
+from pipeline.core import (
+    INPUT_WORDS,
+    NORMAL_95,
+    PACKAGE,
+    guess_names,
+    make_plain,
+    read_bounded_text,
+    read_version,
+    suffix_unit,
+)
 from pipeline.models import (
     LEAST_DELAY_S,
     UNDECIDED,
@@ -29,12 +38,15 @@ from pipeline.models import (
     ModelFile,
     Number,
     Parameter,
+    Place,
     Quantity,
     expect_another_run,
     is_of_one_run,
     is_own,
+    predict_step,
+    time_rise,
 )
-from pipeline.run import MotionError
+from pipeline.run import HORIZON_S, MotionError
 from pipeline.sources import Vehicle, check_geometry
 
 Current = Mapping[str, float]
@@ -200,7 +212,7 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
     head = [
         f"{quote_name(facts.vehicle.name)}: {target.about}.",
         f"Names: {target.source}.",
-        facts.format_fit(),
+        *facts.list_origin(),
         facts.vehicle.format_unknown(),
         "What depends on a value in doubt is commented out." if doubtful else "",
     ]
@@ -260,6 +272,27 @@ def require_plausible(label: str, *values: float, least: float = -LARGEST) -> No
 
 
 _FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
+_LIMITS = frozenset(
+    {
+        Quantity.SPEED_LIMIT,
+        Quantity.TURN_LIMIT,
+        Quantity.WHEEL_SPEED_LIMIT,
+        Quantity.ACCELERATION_LIMIT,
+        Quantity.TURN_ACCELERATION_LIMIT,
+        Quantity.WHEEL_ACCELERATION_LIMIT,
+    }
+)
+"""Quantities that targets have parameters for beside delays."""
+_USUAL_TOP = (1.0, 0.5)
+"""Speed [m/s] and yaw rate [rad/s] if neither the fit nor the vehicle gives the largest ones."""
+STEADY_S = 20.0
+"""Time until the motion counts as steady [s]: twenty times the longest lag that vehicles have."""
+_TRIED = 0.1
+"""Change of a parameter that shows whether a delay depends on it, in parts of it or of a typical one."""
+_UNCHANGED_S = 5e-3
+"""Change of a delay that is none [s]: a tenth of a step of MPPI."""
+_DIGEST = 12
+"""Digits of a recording's hash that tell it from all others."""
 _MOST_GROUNDS = 5
 """Values by ground that a comment lists; of more it has the least and the largest."""
 _LINE = 100
@@ -295,14 +328,12 @@ class Amount:
         sources: a line for each parameter it was computed from; empty if nothing is known.
         effects: ids of the effects among them.
         is_doubtful: whether one of the parameters is in doubt.
-        undefined: ids of the effects that no single value describes; empty where one does.
     """
 
     value: float
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
     is_doubtful: bool = False
-    undefined: frozenset[str] = frozenset()
 
     def __neg__(self) -> Amount:
         return self.change(operator.neg)
@@ -371,20 +402,16 @@ class ParameterTable:
         head: comment lines above them.
         settings: the parameters.
         unknown: names of the parameters that no effect of the model tells.
-        undefined: the same of those that no single value describes, with what keeps it from that.
     """
 
     head: list[str] = field(default_factory=list)
     settings: list[Setting] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
-    undefined: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def add(self, path: str, amount: Amount, note: str = "") -> None:
         """Add a value; of an unknown one only that it is."""
         if amount.is_known:
             self._append(path, _round(amount.value), amount, note)
-        elif amount.undefined:
-            self.undefined[_name_plainly(path)] = amount.undefined
         else:
             self.unknown.append(_name_plainly(path))
 
@@ -493,21 +520,63 @@ class Facts:
         return combine(_find_circle, self.find_wheelbase(), angle)
 
     def find_speed_delay(self) -> Amount:
-        """Delay of the speed behind a smooth command [s]: sum of dead time and time constants."""
-        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.SPEED_LAG))
+        """Delay of the speed behind its command [s]; see `_time_step`."""
+        return self._time_step(self.find_driven()[0], 0.0)
 
     def find_turn_delay(self) -> Amount:
-        """Delay of the yaw rate behind a smooth command [s]; on a car it comes from the steering.
+        """Delay of the yaw rate behind its command [s], on the spot; on a car it is that of the steering."""
+        if self.vehicle.kind == "ackermann":
+            return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.STEERING_LAG))
+        return self._time_step(0.0, self.find_driven()[1])
 
-        Where an effect delays the speed by a time constant and the yaw rate otherwise, as motors do of which
-        those of both sides work against each other in a turn, no single delay describes that.
+    def find_driven(self) -> tuple[float, float]:
+        """Largest speed [m/s] and yaw rate [rad/s] of the runs of the fit, or else of the vehicle."""
+        speed, turn = (max(self.list_driven(key), default=0.0) for key in (DRIVEN_SPEED, DRIVEN_TURN))
+        return speed or self.vehicle.max_speed_mps or _USUAL_TOP[0], turn or _USUAL_TOP[1]
+
+    def _time_step(self, speed: float, turn: float) -> Amount:
+        """Time from a step of the command to 63 % of the motion that follows [s], from rest.
+
+        It is that of the whole model: a dead time and a time constant add up, and so do motors and a ground
+        that have none. Limits are left out: they are parameters of their own. Sources are the parameters on
+        which it depends. It is in doubt where it exceeds the time over which models are judged: a motion that
+        grows for so long does not follow its command by a delay.
         """
-        is_car = self.vehicle.kind == "ackermann"
-        delay = self.take(Quantity.STEERING_LAG if is_car else Quantity.TURN_LAG)
-        uneven = frozenset() if is_car else self.take(Quantity.SPEED_LAG).effects - delay.effects
-        if uneven:
-            return Amount(math.nan, undefined=uneven)
-        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), delay)
+        dead = self.take(Quantity.COMMAND_DELAY)
+        free = {
+            effect.id: effect.change(
+                **{p.name: p.neutral for p in effect.parameters if _LIMITS.intersection(p.quantities)}
+            )
+            for effect in self.file.model
+            if effect.place is not Place.LOCALIZATION
+            and effect.id not in dead.effects
+            and not is_of_one_run(effect.parameters)
+        }
+
+        def time(effects: Mapping[str, Effect]) -> float:
+            moved = predict_step(self.vehicle, tuple(effects.values()), speed, turn, STEADY_S)
+            motion = moved.w if turn else moved.x
+            return time_rise(motion / motion[-1]) if motion[-1] else math.nan
+
+        rise, sources, effects, is_doubtful = time(free), [*dead.sources], {*dead.effects}, dead.is_doubtful
+        for effect, parameter in self._list_numbers():
+            if effect.id not in free or _LIMITS.intersection(parameter.quantities):
+                continue
+            value = effect.values[parameter.name]
+            change = _TRIED * max(abs(value), abs(parameter.typical))
+            tried = free[effect.id].change_within(**{parameter.name: value + change})
+            if not abs(time({**free, effect.id: tried}) - rise) <= _UNCHANGED_S:
+                sources.append(self._format_source(effect, parameter))
+                effects.add(effect.id)
+                is_doubtful |= bool(self.file.find_number(effect, parameter).doubt)
+        if not sources:
+            return Amount(math.nan)
+        step = f"{turn:.3g} rad/s" if turn else f"{speed:.3g} m/s"
+        sources.append(f"time to 63 % of the motion after a step of {step}")
+        if rise > HORIZON_S:
+            sources.append(f"no delay describes a motion that grows for more than {HORIZON_S:g} s")
+            is_doubtful = True
+        return Amount(dead.value + rise, tuple(sources), frozenset(effects), is_doubtful)
 
     def find_speed_limit(self) -> Amount:
         """Largest speed of the body [m/s], from its command or from the wheels when driving straight.
@@ -581,12 +650,25 @@ class Facts:
         rows = self.file.list_fitted("runs")
         return [value for row in rows if isinstance(value := row.get(key), float)]
 
-    def format_fit(self) -> str:
-        """Data that the model was fitted to; empty before a fit."""
-        names = [quote_name(str(run.get("run"))) for run in self.file.list_fitted("runs")]
+    def list_origin(self) -> list[str]:
+        """What the values come from: the version that writes them, and the runs of a fit."""
+        names = []
+        for run in self.file.list_fitted("runs"):
+            digest = str(run.get("sha256") or "")[:_DIGEST]
+            names.append(f"{quote_name(str(run.get('run')))}{digest and f' (SHA-256 {digest})'}")
         source = str(self.file.fit.get("input"))
         words = INPUT_WORDS.get(source) or quote_name(source)
-        return f"Fitted {words} of {', '.join(names)}." if names else ""
+        fitted = [f"Fitted {words} of {', '.join(names)}."] if names else []
+        return [f"Written by {PACKAGE} {read_version()}.", *fitted]
+
+    def list_sources(self) -> list[str]:
+        """All parameters that act, with their intervals and doubts."""
+        return [
+            self._format_source(effect, parameter)
+            for effect in self.file.model
+            for parameter in effect.parameters
+            if effect.is_used(parameter)
+        ]
 
     def _spin(self, quantity: Quantity) -> Amount:
         return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))
@@ -665,8 +747,6 @@ def list_comments(facts: Facts, table: ParameterTable) -> list[str]:
     lines += [f"  {line}" for line in unmapped]
     lines += ["Not written, as no effect of the model determines it:"] if unknown else []
     lines += [f"  {line}" for line in textwrap.wrap(unknown, _LINE)]
-    for name, effects in table.undefined.items():
-        lines.append(f"Not written, as a single value does not describe {', '.join(sorted(effects))}: {name}")
     return [make_plain(line) for line in lines]
 
 

@@ -35,7 +35,6 @@ _ROBOT, _CAR = ("differential",), ("ackermann",)
 _BOTH, _SIDEWAYS = ("differential", "ackermann"), ("mecanum", "omni")
 _FOLLOW = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"
-_DELAY = "MPPI: the sum of dead times and time constants, the delay behind a smooth command"
 _PURSUIT = "regulated pure pursuit"
 
 NAV2 = Target(
@@ -47,9 +46,9 @@ NAV2 = Target(
     # Limits are the largest that were reached: smaller ones that are set on purpose remain valid. A vehicle
     # that moves sideways gets delays only: its limits depend on the direction, which these parameters do not.
     (
-        Row(f"{_FOLLOW}.model_delay_vx", "speed_delay", _DELAY),
-        Row(f"{_FOLLOW}.model_delay_vy", "speed_delay", _DELAY, _SIDEWAYS),
-        Row(f"{_FOLLOW}.model_delay_wz", "turn_delay", _DELAY),
+        Row(f"{_FOLLOW}.model_delay_vx", "speed_delay", "MPPI"),
+        Row(f"{_FOLLOW}.model_delay_vy", "speed_delay", "MPPI", _SIDEWAYS),
+        Row(f"{_FOLLOW}.model_delay_wz", "turn_delay", "MPPI"),
         Row(f"{_FOLLOW}.vx_max", "speed_limit", "MPPI", _BOTH),
         Row(f"{_FOLLOW}.vx_min", "-speed_limit", "MPPI", _BOTH),
         Row(f"{_FOLLOW}.wz_max", "turn_limit", "MPPI", _BOTH),

@@ -15,8 +15,8 @@ from typing import Any, cast
 
 import msgspec
 
-from pipeline.core import Floats
-from pipeline.export import Target
+from pipeline.core import Floats, make_plain
+from pipeline.export import Facts, Target
 from pipeline.models import (
     Delay,
     Effect,
@@ -77,12 +77,12 @@ def write_function(model: Model) -> str:
 
 
 def _write_file(file: ModelFile) -> str:
-    """The function with the doubts about its values as comments above it."""
+    """The function with what its values come from, their intervals and their doubts as comments above it."""
     head, _, rest = write_function(file.model).partition("\n\n")
-    doubts = "".join(
-        f"# In doubt: {label}: {number.reason}.\n" for label, number in file.list_doubtful().items()
-    )
-    return f"{head}\n\n{doubts}{rest}"
+    facts = Facts(file)
+    lines = [*facts.list_origin(), *(f"  {line}" for line in facts.list_sources())]
+    comment = "\n".join(f"# {make_plain(line)}" for line in lines)
+    return f"{head}\n\n{comment}\n\n{rest}"
 
 
 def _write_step(effect: Effect, vehicle: Vehicle) -> _Step:

@@ -9,16 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.core import Flags, Floats
-from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Facts
+from pipeline.export import STEADY_S, Facts
 from pipeline.models import Effect, Place, Quantity, predict_step
 from pipeline.sources import Vehicle
 
 _SPEEDS = 4
 """Number of speeds: quarters of the largest driven one show a factor that falls or rises with speed."""
-_STEADY_S = 20.0
-"""Time until the motion counts as steady [s]: twenty times the longest lag that vehicles have."""
-_USUAL_TOP = (1.0, 0.5)
-"""Speed [m/s] and yaw rate [rad/s] if neither the fit nor the vehicle gives the largest ones."""
 _SAME = 0.01
 """Spread of a factor over the speeds that one value still fits: the tolerance of data sheets."""
 _LIMITS = frozenset({Quantity.SPEED_LIMIT, Quantity.TURN_LIMIT, Quantity.WHEEL_SPEED_LIMIT})
@@ -37,7 +33,7 @@ def find_steady_motion(
         turn: commanded yaw rate [rad/s].
     """
     acting = [effect for effect in effects if effect.place is not Place.LOCALIZATION]
-    moved = predict_step(vehicle, acting, speed, turn, _STEADY_S)
+    moved = predict_step(vehicle, acting, speed, turn, STEADY_S)
     return float(moved.x[-1]), float(moved.w[-1])
 
 
@@ -72,8 +68,8 @@ class Response(NamedTuple):
 def find_response(facts: Facts) -> Response:
     """Drive the model at several speeds, straight and in a turn at half of the largest driven yaw rate."""
     vehicle, effects = facts.vehicle, facts.file.model.effects
-    top, turn = (max(facts.list_driven(key), default=0.0) for key in (DRIVEN_SPEED, DRIVEN_TURN))
-    top, turn = top or vehicle.max_speed_mps or _USUAL_TOP[0], 0.5 * (turn or _USUAL_TOP[1])
+    top, turn = facts.find_driven()
+    turn *= 0.5
     speeds = [float(f"{top * (n + 1) / _SPEEDS:.3g}") for n in range(_SPEEDS)]
     free = [
         one for one in effects if not _LIMITS.intersection(q for p in one.parameters for q in p.quantities)

@@ -121,6 +121,6 @@ else:
                 "is_of_one_run",
                 "stands_at_bound",
             ),
-            "step": ("predict_step",),
+            "step": ("predict_step", "time_rise"),
         },
     )

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping
 from copy import copy
 from functools import cached_property
+from types import MappingProxyType
 from typing import ClassVar, Literal, Self, TypeVar
 
 from pipeline.core import suffix_unit
@@ -28,7 +29,7 @@ from pipeline.models.parameter import (
     Search,  # noqa: F401 - what a file of an effect needs
     Spread,  # noqa: F401 - what a file of an effect needs
 )
-from pipeline.models.words import Sentences, find_words
+from pipeline.models.words import MOST_DIGITS, Sentences, find_words
 from pipeline.run import Commands, Floats, MotionError, Rolling, RunContext, Velocity, Wheels
 from pipeline.sources import Vehicle, list_kinds
 
@@ -105,6 +106,8 @@ class Effect(ABC):
         values: parameter values by name.
         fixed: names of parameters that a fit does not change.
         open_numbers: names of parameters that sentences leave out.
+        shown_digits: significant digits of parameters, and of what sentences compute from them, by name; all
+            that a sentence has for others.
     """
 
     id: str
@@ -129,6 +132,7 @@ class Effect(ABC):
     has_state: bool = False
     readings: tuple[Meaning, ...] = ()
     open_numbers: frozenset[str] = frozenset()
+    shown_digits: Mapping[str, int] = MappingProxyType({})
 
     def __init_subclass__(cls) -> None:
         """Add the facts about pairs of the catalogue."""
@@ -154,6 +158,12 @@ class Effect(ABC):
         """The same effect with parameters that its sentences leave out."""
         effect = copy(self)
         effect.open_numbers = frozenset(names)
+        return effect
+
+    def limit_digits(self, digits: Mapping[str, int]) -> Self:
+        """The same effect whose sentences have at most so many significant digits, by parameter."""
+        effect = copy(self)
+        effect.shown_digits = digits
         return effect
 
     @cached_property
@@ -229,7 +239,8 @@ class Effect(ABC):
         if said.words.motion:
             return said.describe_motion()
         known = [p for p in self.parameters if p.name not in self.open_numbers]
-        numbers = [f"{p.name} = {self.values[p.name]:.3g}{suffix_unit(p.unit)}" for p in known]
+        shown = {p: min(self.shown_digits.get(p.name, MOST_DIGITS), MOST_DIGITS) for p in known}
+        numbers = [f"{p.name} = {self.values[p.name]:.{n}g}{suffix_unit(p.unit)}" for p, n in shown.items()]
         return f"{said.title}: {', '.join(numbers)}"
 
     def describe_clause(
@@ -245,7 +256,8 @@ class Effect(ABC):
         others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}
         title = self.id.replace("_", " ").capitalize()
         values = {**self.values, **self.list_seen(vehicle, beside, asked)}
-        return Sentences(title, find_words(self.id), values, vehicle, self.open_numbers, others)
+        words, unknown, digits = find_words(self.id), self.open_numbers, self.shown_digits
+        return Sentences(title, words, values, vehicle, unknown, others, digits)
 
     def list_seen(
         self, vehicle: Vehicle, beside: Iterable[Effect] = (), asked: Asked | None = None

@@ -22,6 +22,10 @@ STEP_CELL_S = 0.02
 _RESTS_S = 1.0
 """Time at rest before the step [s]: more than the longest dead time."""
 _COMMAND_S = 0.05
+_LEAST_REST = 1e-3
+"""Rest of a motion that has ended."""
+_RISEN = 1.0 - math.exp(-1.0)
+"""Share of its end value that a first-order lag reaches after its time constant."""
 
 
 def predict_step(
@@ -68,6 +72,23 @@ def predict_step(
     forward = ForwardModel(series, grid, context, encoders=None, has_gyro=False)
     moved = forward.run_commands(effects, Timing())
     return Velocity(moved.x[rests:], moved.y[rests:], moved.w[rests:])
+
+
+def time_rise(share: Floats) -> float:
+    """Time to 63 % [s]: of a first-order lag its time constant; NaN where it is not reached.
+
+    Args:
+        share: motion over its end, or over its command, at every `STEP_CELL_S` after a step, shape (n,).
+    """
+    reached = np.flatnonzero(share >= _RISEN)
+    if not reached.size:
+        return math.nan
+    after = int(reached[0])
+    if after == 0:
+        return 0.0
+    # Values are those of the middles of the cells; between two of them it is taken for a first-order lag.
+    passed = -np.log(np.maximum(1.0 - share[after - 1 : after + 1], _LEAST_REST))
+    return STEP_CELL_S * float(np.interp(1.0, passed, (after - 0.5, after + 0.5)))
 
 
 def _reset(count: int, signals: int) -> Resets:

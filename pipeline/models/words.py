@@ -10,7 +10,14 @@ from importlib import resources
 
 import msgspec
 
-from pipeline.core import Floats, enumerate_texts, format_angle, format_digits, format_length, format_share
+from pipeline.core import (
+    enumerate_texts,
+    format_angle,
+    format_digits,
+    format_length,
+    format_share,
+    round_digits,
+)
 from pipeline.models.expression import Expression, parse_expression
 from pipeline.models.parameter import PLAIN
 from pipeline.sources import Vehicle
@@ -29,6 +36,8 @@ _FORMATS: Mapping[str, Callable[[float], str]] = {
     "percent": lambda value: format_share(value, 3),
     "less": lambda value: f"{format_share(abs(1.0 - value), 0)} {'less' if value <= 1.0 else 'more'}",
 }
+MOST_DIGITS = 3
+"""Significant digits of the formats that have most."""
 _BRISK_MPS = 3.0
 """Speed at which an effect that grows with it is told [m/s]; of a slower vehicle, its largest."""
 
@@ -83,6 +92,8 @@ class Sentences:
         vehicle: nominal geometry.
         unknown: names of parameters that are left out.
         beside: first parameters of the other effects of the model, by id.
+        digits: significant digits of parameters, by name; a number computed from several has as many as the
+            one that has fewest.
     """
 
     title: str
@@ -91,6 +102,7 @@ class Sentences:
     vehicle: Vehicle
     unknown: frozenset[str] = frozenset()
     beside: Mapping[str, float] = field(default_factory=dict)
+    digits: Mapping[str, int] = field(default_factory=dict)
 
     def describe_motion(self) -> str:
         """Name and numbers; the name alone where no number is known."""
@@ -127,9 +139,13 @@ class Sentences:
             head = name if is_known(name) else self.title
             text = head + (text and f": {text}")
         text = text.replace("{with}", named and f", with {named}")
-        return _FIELD.sub(
-            lambda match: _format(_parse(match[1], tuple(values)).evaluate(values), match[2]), text
-        )
+
+        def write(match: re.Match[str]) -> str:
+            formula = _parse(match[1], tuple(values))
+            digits = [self.digits[name] for name in formula.names if name in self.digits]
+            return _format(float(formula.evaluate(values)), match[2], min(digits, default=MOST_DIGITS))
+
+        return _FIELD.sub(write, text)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -137,8 +153,10 @@ def _parse(formula: str, names: tuple[str, ...]) -> Expression:
     return parse_expression(formula, dict.fromkeys(names, PLAIN), "words.toml")
 
 
-def _format(value: Floats | float, spec: str) -> str:
-    number = float(value)
+def _format(number: float, spec: str, digits: int) -> str:
+    """A number with the digits of its format, or with fewer; it is rounded once."""
     if "|" in spec:
         return spec.split("|")[number < 0.0]
+    if digits < MOST_DIGITS:
+        number = round_digits(number, digits)
     return _FORMATS[spec](number) if spec in _FORMATS else format(number, spec)

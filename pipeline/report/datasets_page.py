@@ -30,6 +30,7 @@ from pipeline.report import Picture, bracket_unit, format_number, label_names, t
 from pipeline.report.page import write_pictures
 from pipeline.report.pages import Page, Section
 from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axis
+from pipeline.results import BUDGET_SLIP
 from pipeline.store import Store
 from pipeline.words import (
     Table,
@@ -239,9 +240,7 @@ def _draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture
         .mark("bar")
         .encode(
             y=encode_column("dataset:N", sort=list(labels.values()), axis={"title": None, "grid": False}),
-            x=encode_column(
-                "sum(slip):Q", axis={"title": "RMS slip over half a second [m/s]", "format": ",~r"}
-            ),
+            x=encode_column("sum(slip):Q", axis={"title": f"{BUDGET_SLIP} [m/s]", "format": ",~r"}),
             color=encode_column(
                 "cause:N", legend={"title": None, "columns": 3}, scale={"scheme": "tableau20"}
             ),
@@ -251,8 +250,8 @@ def _draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture
     )
     text = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
     note = "A negative part increases the held-out slip of the model."
-    drawing = Drawing(chart, {"causes": rows}, note, f"RMS slip: {text}.")
-    return Picture("causes", "RMS slip of each dataset by cause", drawing)
+    drawing = Drawing(chart, {"causes": rows}, note, f"{BUDGET_SLIP}: {text}.")
+    return Picture("causes", f"{BUDGET_SLIP} of each dataset by cause", drawing)
 
 
 def write_fleet(store: Store, fleet: Fleet) -> dict[str, Path]:

@@ -18,6 +18,7 @@ else:
             "reading": (
                 "ABOVE_FLOOR",
                 "BREVITY",
+                "BUDGET_SLIP",
                 "CAUSE_NAMES",
                 "CHANCE",
                 "CHANGE",

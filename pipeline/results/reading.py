@@ -247,5 +247,7 @@ def format_rises(below: object, errors: object, forgiven: float = NOTHING) -> st
     return ", ".join(phrases)
 
 
+BUDGET_SLIP = "RMS slip over half a second"
+"""What budgets of slip share out: the square root of their totals."""
 CAUSE_NAMES = {"localization_noise": "localization noise"}
 """Causes of an error budget in words, where these differ from the id."""

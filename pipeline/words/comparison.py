@@ -29,6 +29,7 @@ from pipeline.datasets import (
 )
 from pipeline.datasets.causes import CausePart
 from pipeline.datasets.levels import LEVEL
+from pipeline.results import BUDGET_SLIP
 from pipeline.words.tables import NOTHING, Cell, Column, Table
 
 _GROUND = "ground alone"
@@ -249,7 +250,7 @@ def format_causes(causes: Causes, *, everything: bool) -> list[str]:
         shown = [one for one in budget.parts if everything or abs(one.value) >= _LEAST_SHARE]
         parts = [f"{causes.names.get(one.name, one.name)} {format_share(one.value, 0)}" for one in shown]
         rms, runs = format_two(budget.total**0.5), format_count(budget.runs, "run")
-        lines += ["", f"{budget.dataset}: root mean square {rms} m/s, {runs}", f"  {', '.join(parts)}"]
+        lines += ["", f"{budget.dataset}: {BUDGET_SLIP} {rms} m/s, {runs}", f"  {', '.join(parts)}"]
     sentences = [one.describe(causes.names) for one in causes.differences]
     return [
         *lines,
@@ -365,7 +366,7 @@ def tabulate_causes(causes: Causes) -> list[Table]:
         Column("95 %", number=True),
         Column("p adjusted", number=True),
     )
-    caption = "Differences of RMS slip by cause; p over the causes of a pair"
+    caption = f"Differences of {BUDGET_SLIP} by cause; p over the causes of a pair"
     return [
         Table("Budgets: shares of the mean square slip, means over runs", shares, budgets).drop_empty(),
         Table(caption, parts, differences).drop_empty(),

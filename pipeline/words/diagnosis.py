@@ -20,6 +20,7 @@ from pipeline.recording import Finding, Severity
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
+    BUDGET_SLIP,
     CHANCE,
     CHANGE,
     DETECTED_SHARE,
@@ -519,7 +520,7 @@ def _format_budget(run: RunDiagnosis) -> str:
         if (budget.input, budget.quantity) == (run.input, "slip"):
             parts = [f"{name_term(one.effect)} {format_part(one.share)}" for _, one in budget.causes]
             signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
-            total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
+            total = f"{BUDGET_SLIP} {math.sqrt(budget.total):.3g} m/s"
             return f"error budget by cause ({total}): {', '.join(parts)}{signs}"
     return ""
 

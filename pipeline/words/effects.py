@@ -33,7 +33,8 @@ def restore_known(name: str, values: Mapping[str, Number]) -> Effect:
     A value that is estimated to be neutral stays; so does a single parameter.
     """
     new = find_effect(name)()
-    effect = new.change(**{k: new.parameter(k).round(one.value, one.digits) for k, one in values.items()})
+    effect = new.change(**{key: one.value for key, one in values.items()})
+    effect = effect.limit_digits({key: one.digits for key, one in values.items()})
     if len(new.parameters) == 1:
         return effect
     unknown = {key: one for key, one in values.items() if one.is_open(new.parameter(key))}

@@ -68,7 +68,7 @@ def test_what_makes_the_difference_is_named_and_what_is_alike_is_not() -> None:
     assert parts["effective_track"].p_adjusted > 0.05
     told = difference.describe({"wheel_radius": "longitudinal_slip"})
     assert told.startswith("ice has 0.")
-    assert "m/s more RMS slip than asphalt; by cause in m/s: +" in told
+    assert "m/s more RMS slip over half a second than asphalt; by cause in m/s: +" in told
     assert "longitudinal_slip" in told.partition("; significant: ")[2]
 
 

@@ -13,9 +13,10 @@ from target_schemas import SCHEMAS
 from verbs import run_verb
 
 from pipeline import export
+from pipeline.core import PACKAGE, read_version
 from pipeline.export import Facts, export_model, list_targets
 from pipeline.export.spread import find_response
-from pipeline.models import Effect, find_effect, format_model, list_effects
+from pipeline.models import find_effect, format_model, list_effects, predict_step
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
 
@@ -40,8 +41,9 @@ def test_targets_are_found_by_being_there() -> None:
 def test_names_types_and_bounds_are_those_that_the_project_declares_and_each_is_written() -> None:
     written: dict[str, set[str]] = {name: set() for name in PARAMETERS}
     # Some parameters are those of a kind of car or robot alone.
-    for name, vehicle in (*CASES, *((name, CAR) for name in PARAMETERS if name != "vesc"), ("nav2", MECANUM)):
-        found = read(name, export_model(make_full(vehicle), name))
+    cases = [(n, make_full(v)) for n, v in (*CASES, *((n, CAR) for n in PARAMETERS if n != "vesc"))]
+    for name, file in (*cases, ("nav2", make(find_effect("transport_delay")(d=0.1), vehicle=MECANUM))):
+        found = read(name, export_model(file, name))
         written[name] |= set(found)
         for path, value in found.items():
             schema = SCHEMAS[name][path]
@@ -74,7 +76,8 @@ def test_every_effect_stands_at_a_line_or_among_those_without_one() -> None:
             stands = any(f"{effect.id}.{p.name} = " in below for p in effect.parameters)
             assert stands or effect.id in unmapped, (effect.id, head)
         known = {e.id for e in file.model if any(p.quantities for p in e.parameters)}
-        assert unmapped >= {e.id for e in file.model} - known
+        # What a step of the command does depends on all of them.
+        assert name == "nav2" or unmapped >= {e.id for e in file.model} - known
         assert unmapped != {e.id for e in file.model} or name in {"robot_localization", "nav2_amcl"}
 
 
@@ -232,6 +235,20 @@ def test_an_expected_range_that_is_assumed_is_said_to_be() -> None:
         assert number["another_run"]["low"] < 0.98 * value < 1.02 * value < number["another_run"]["high"]
 
 
+@pytest.mark.parametrize("name", sorted({target.name for target in list_targets()} - {"json"}))
+def test_every_text_says_which_version_and_recording_its_values_come_from(name: str) -> None:
+    (run,) = FIT["runs"]  # type: ignore[misc]
+    fit = {**FIT, "runs": [{**run, "sha256": "8be38fc23b7a246891"}]}  # type: ignore[misc]
+    vehicle = F1TENTH if name in {"autoware", "vesc"} else HUSKY
+    ends = {"drive_lag.tau": (0.2, 0.4)}
+    text = export_model(
+        make(find_effect("drive_lag")(tau=0.3), vehicle=vehicle, fit=fit, intervals=ends), name
+    )
+    assert f"Written by {PACKAGE} {read_version()}." in text
+    assert "Fitted from wheel encoders of 'yard/monday' (SHA-256 8be38fc23b7a)." in text
+    assert "drive_lag.tau = 0.3 s (this run, 95 %: 0.2 to 0.4; another run: " in text
+
+
 def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be() -> None:
     (run,) = FIT["runs"]  # type: ignore[misc]
     late = {**FIT, "runs": [{**run, "pose_delay_s": 0.42}]}  # type: ignore[misc]
@@ -247,13 +264,30 @@ def test_a_parameter_that_no_effect_tells_is_named_as_one_that_is_not_written() 
     assert "vx_max" not in unknown.partition("controller_server:")[2]
 
 
-@pytest.mark.parametrize("beside", [(), (find_effect("transport_delay")(d=0.1),)])
-def test_a_delay_that_is_no_single_one_is_said_to_be_none(beside: tuple[Effect, ...]) -> None:
-    text = export_model(make(find_effect("wheel_servo")(tau=0.3), *beside), "nav2")
-    head, _, rest = text.partition("controller_server:")
-    assert "a single value does not describe wheel_servo: FollowPath.model_delay_wz" in head
-    assert "model_delay_vx: " in rest
-    assert "model_delay_wz" not in rest
+@pytest.mark.parametrize("dead_s", [0.0, 0.1])
+def test_mppi_is_told_the_step_response_that_the_motors_have(dead_s: float) -> None:
+    # Its time constant is that of a motor without load: on the ground it is later, most of all in a turn.
+    servo = find_effect("wheel_servo")(tau=0.2, bound=1.5, no_load=4.0, scrub=1.2, reset=0.35)
+    fit = {**FIT, "runs": [{**FIT["runs"][0], "driven_speed_mps": 2.0, "driven_yaw_rate_radps": 3.0}]}  # type: ignore[index]
+    ends = {f"wheel_servo.{name}": (0.9 * value, 1.1 * value) for name, value in servo.values.items()}
+    ends["transport_delay.d"] = (0.09, 0.11)
+    delay = find_effect("transport_delay")(d=dead_s)
+    p = take("nav2", make(servo, delay, fit=fit, intervals=ends))
+    for axis, asked in (("vx", (2.0, 0.0)), ("wz", (0.0, 3.0))):
+        moved = predict_step(HUSKY, (servo,), *asked, 20.0)  # type: ignore[arg-type]
+        motion = moved.w if asked[1] else moved.x
+        late = np.flatnonzero(motion >= 0.632 * motion[-1])[0] * 0.02
+        assert late > 0.2
+        assert p[f"FollowPath.model_delay_{axis}"] == pytest.approx(dead_s + late, abs=0.02)
+
+
+def test_a_motion_that_grows_slowly_is_no_delay() -> None:
+    lag = find_effect("turn_lag")(tau_mean=0.2, tau_diff=2.7)
+    ends = {"turn_lag.tau_mean": (0.19, 0.21), "turn_lag.tau_diff": (2.6, 2.8)}
+    text = export_model(make(lag, fit=FIT, intervals=ends), "nav2")
+    assert "\n      model_delay_vx: 0.2" in text
+    assert "# no delay describes a motion that grows for more than 2 s" in text
+    assert "\n      # model_delay_wz: 2.69" in text
 
 
 def test_what_several_parameters_come_from_is_said_once() -> None:

@@ -7,10 +7,12 @@ import polars as pl
 import pytest
 from few import few
 from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
+from scipy.signal import lfilter
 
 from pipeline.core import rigid
 from pipeline.core.arrays import nearest_indices
 from pipeline.estimation import EstimationData, Input, RunResiduals, fit_model
+from pipeline.estimation.estimates import read_clock
 from pipeline.estimation.prediction import predict_from
 from pipeline.models import Model, find_effect
 from pipeline.run import MotionRun, load_run
@@ -40,6 +42,12 @@ def draw_ages(count: int, spread: float) -> np.ndarray:
     for index in range(1, count):
         ages[index] = 0.7 * ages[index - 1] + random.normal(0.0, spread * np.sqrt(1.0 - 0.49))
     return ages
+
+
+def draw_slow_ages(count: int, spread: float, seed: int) -> np.ndarray:
+    """Ages that change over seconds."""
+    noise = np.random.default_rng(seed).normal(0.0, spread * np.sqrt(1.0 - 0.95**2), count)
+    return lfilter((1.0,), (1.0, -0.95), noise)
 
 
 def delay(times: np.ndarray, ages: np.ndarray) -> np.ndarray:
@@ -91,6 +99,19 @@ def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame])
     assert np.std(after) < 0.4 * np.std(before)
     everywhere = run.track.times - true
     assert np.std(everywhere) < np.std(stamps - true)
+
+
+@pytest.mark.parametrize("seed", few(range(8), 3))
+def test_the_interval_of_a_clock_is_that_of_its_mean(tables: Mapping[str, pl.DataFrame], seed: int) -> None:
+    poses = tables["poses"]
+    true = poses["t"].to_numpy()
+    stamps = delay(true, 0.3 + draw_slow_ages(true.size, 0.06, seed))
+    run = load(tables, poses=poses.with_columns(pl.Series("t", stamps)))
+    clock = find_effect("clock_offset").of_delay(run.alignment.heading_delay_s)
+    number = read_clock(clock, run)["d"]
+    assert number.low <= np.mean(stamps - true) <= number.high
+    # Single poses vary by twice 0.06 s about it.
+    assert number.high - number.low < 0.12
 
 
 def test_the_path_tells_how_old_poses_of_straight_driving_are(tables: Mapping[str, pl.DataFrame]) -> None:

@@ -177,3 +177,12 @@ def test_what_a_dead_encoder_makes_is_no_fact_beside_it() -> None:
     assert [text.startswith("!  perhaps by the dead encoder: ") for text in shown] == [False, True]
     (alone,) = list_findings({"run": [stuck]}, "", everything=True)
     assert "dead" not in alone[1]
+
+
+@pytest.mark.parametrize(
+    ("k", "half", "share"), [(1.985, 0.04, "50 %"), (1.985, 0.001, "50 %"), (1.94, 0.4, "52 %")]
+)
+def test_a_share_is_rounded_once(k: float, half: float, share: str) -> None:
+    drawn = draw_diagnosis({"effective_track": {"k": k}}, [(1.0, 1.0), (0.5, 0.3)])
+    known = replace(drawn.effects[0], parameters={"k": Number(k, k - half, k + half)})
+    assert describe_clause(known, drawn) == f"turns at {share} of the ideal rate"

@@ -41,7 +41,7 @@ from pipeline.models.families import TIME_CONSTANT
 from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Asked, Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
-from pipeline.models.step import STEP_CELL_S, predict_step
+from pipeline.models.step import predict_step, time_rise
 from pipeline.run import HORIZON_S, RunContext, Wheels
 from pipeline.sources import Vehicle
 
@@ -61,7 +61,7 @@ _ALIKE_AT, _SLOPES = 3.0, (0.5, 0.7, 1.4, 2.0)
 """Speed [m/s] at which other motors have the same force, and how fast theirs falls, by that of this one."""
 _STEP_MPS, _WATCHED_S = 1.0, 5.0
 """Step of the command that describes it without a run [m/s], and how long it is watched [s]."""
-_RISEN, _NEARLY_ALL = 1.0 - math.exp(-1.0), 0.98
+_NEARLY_ALL = 0.98
 """Share of a step after one time constant, and share that counts as all of it."""
 _TINY = 1e-6
 """Friction [m/s] that counts as none: a divisor."""
@@ -265,9 +265,7 @@ class WheelServo(JointDrive):
             return seen
         drive = [one for one in beside if one.place <= Place.DRIVE and one.id != self.id]
         if step > 0.0:
-            straight = predict_step(vehicle, [*drive, self], step, 0.0, _WATCHED_S).x / step
-            if straight.max() >= _RISEN:
-                seen["rise"] = float(np.argmax(straight >= _RISEN) + 1) * STEP_CELL_S
+            seen["rise"] = time_rise(predict_step(vehicle, [*drive, self], step, 0.0, _WATCHED_S).x / step)
         if turn > 0.0:
             turned = float(predict_step(vehicle, [*drive, self], 0.0, turn, HORIZON_S).w[-1]) / turn
             seen |= {"turned": turned} if turned < _NEARLY_ALL else {}
