@@ -43,6 +43,7 @@ else:
                 "check_drive",
                 "list_plan_files",
                 "plan_drive",
+                "suggest_plan",
             ),
             "fitted_model": (
                 "Fit",

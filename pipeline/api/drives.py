@@ -14,11 +14,16 @@ from pipeline.analysis import Options
 from pipeline.api.opening import Opener, Progress, open_quietly, show_nothing
 from pipeline.core import SlipError, format_count, format_duration
 from pipeline.estimation import DiagnosisInput, diagnose_runs, load_recording
-from pipeline.estimation.stored_diagnosis import read_recording
+from pipeline.estimation.stored_diagnosis import find_diagnosis, read_recording
 from pipeline.plan import SAFETY, CheckedPlan, Plan
 from pipeline.report.drive_pages import leave_plan, write_drive
+from pipeline.results import RunDiagnosis
 from pipeline.sources import Vehicle, find_preset, list_presets
 from pipeline.store import Manifest, Store
+
+_TIME, _AREA = "60s", "20x10m"
+_LONGEST_SUGGESTED_S = 300.0
+"""Longest drive that is suggested without being asked for."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +102,8 @@ def plan_drive(
     folder: Path,
     *,
     vehicle: str | None = None,
-    time: str = "60s",
-    area: str = "20x10m",
+    time: str = _TIME,
+    area: str = _AREA,
     max_speed: float | None = None,
     max_yaw_rate: float | None = None,
     max_acceleration: float | None = None,
@@ -140,8 +145,9 @@ def plan_drive(
         notify("diagnosis")
         studied, first = planning.Studied(chosen), None
         if gathered is not None:
-            studied = planning.study(gathered.recordings, chosen, notify)
             first = gathered.manifests[0]
+            stored = find_diagnosis(options.out, first) if len(gathered.manifests) == 1 else None
+            studied = planning.study(gathered.recordings, chosen, notify, stored)
         limits = planning.choose_limits(
             chosen,
             studied.largest,
@@ -164,6 +170,49 @@ def plan_drive(
     return PlannedDrive(made, files, studied.driven_s, gathered.lossy, report, warning)
 
 
+def suggest_plan(run: str, options: Options) -> str | None:
+    """The flags of a `slip plan` that decides which effects act, where the diagnosis of a run leaves it open.
+
+    Args:
+        run: a stored run.
+        options: with the folder of results.
+
+    Returns:
+        Empty where the usual drive decides it; None where no drive of a few minutes on the usual area does.
+    """
+    vehicle, recordings, manifests, _ = _gather([run], options, open_quietly)
+    known = find_diagnosis(options.out, manifests[0])
+    return None if known is None else _suggest(recordings, vehicle, manifests[0], known)
+
+
+def _suggest(
+    recordings: Sequence[DiagnosisInput], vehicle: Vehicle, first: Manifest, known: RunDiagnosis
+) -> str | None:
+    """Flags of the plan that decides something of what a diagnosis of runs leaves undecided."""
+    if not known.undecided:
+        return None
+    seconds, flags = planning.parse_time(_TIME), ""
+    try:
+        studied, area = planning.study(recordings, vehicle, known=known), planning.parse_area(_AREA, vehicle)
+        limits, played = (
+            planning.choose_limits(vehicle, studied.largest),
+            planning.choose_topic(vehicle, first),
+        )
+        while seconds <= _LONGEST_SUGGESTED_S:
+            made = planning.make_plan(studied, limits, area, seconds, played)
+            choices = [one for one in made.questions if one.kind == "separation"]
+            if any(one in made.decided for one in choices):
+                return flags
+            longer = min(one.longer_s for one in choices)
+            if longer <= seconds:
+                return None
+            seconds, flags = longer, f" --time {longer:g}s"
+    except SlipError:
+        # What cannot be planned is not suggested.
+        return None
+    return None
+
+
 @dataclass(frozen=True)
 class DrivenPlan:
     """A plan beside what was driven.
@@ -171,13 +220,13 @@ class DrivenPlan:
     Attributes:
         checked: which promises were kept.
         earlier: the runs that the plan was made of.
-        is_open: whether something is still undecided.
+        following: flags of the `slip plan` that decides what is still undecided; None where none does.
         lossy: whether a log had losses.
     """
 
     checked: CheckedPlan
     earlier: Sequence[str]
-    is_open: bool
+    following: str | None
     lossy: bool
 
     def describe(self) -> list[str]:
@@ -222,13 +271,15 @@ def check_drive(
         what = f"the plan is for {stored.vehicle}, and the log is of {drive.vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
-    vehicle, recordings, _, lossy = _gather(before, options, opened, drive)
+    vehicle, recordings, manifests, lossy = _gather(before, options, opened, drive)
     with progress(names[0]) as notify:
         notify("diagnosis")
         driven = [load_recording(recording, vehicle) for recording in drive.recordings]
         planning.require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
-        diagnosis = diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
-    return DrivenPlan(planning.check_plan(stored, diagnosis), before, bool(diagnosis.undecided), lossy)
+        together = [*recordings[new:], *drive.recordings]
+        diagnosis = diagnose_runs(together, vehicle).runs[0]
+        following = _suggest(together, vehicle, manifests[0], diagnosis)
+    return DrivenPlan(planning.check_plan(stored, diagnosis), before, following, lossy)
 
 
 class _Gathered(NamedTuple):

@@ -141,6 +141,7 @@ def format_run(
     twin: str = "",
     replaced: str = "",
     said: str = "",
+    plan: str | None = None,
     everything: bool = False,
 ) -> str:
     """The summary of one run as lines of text: the verdict, the effects, what remains and what to do.
@@ -151,6 +152,7 @@ def format_run(
         twin: a log of the same content that it shares.
         replaced: what the earlier results that this run replaces were made with, and where they are.
         said: what was chosen on the command line, to be said again by the next command.
+        plan: flags of the `slip plan` that decides what is undecided; None where none does.
         everything: whether more is shown than what everybody reads.
     """
     verdict = str(summary.get("verdict") or "")
@@ -170,7 +172,7 @@ def format_run(
         *(_row(*row) for row in words.list_findings({"": every}, verdict, everything=everything)),
         *([_row("same", f"content as {twin}: counted once, under that name")] if twin else []),
         *([_row("replaced", f"earlier results, {replaced}")] if replaced else []),
-        *_format_end(summary, said, unchanged=unchanged),
+        *_format_end(summary, said, plan, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
 
@@ -299,7 +301,7 @@ def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     return described
 
 
-def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
+def _format_end(summary: Summary, said: str, plan: str | None, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
         lines.append(
@@ -314,8 +316,8 @@ def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     elif RunReport(summary).refusal:
         log = _relative(str(mapping_in(summary, "log").get("path") or "LOG"))
         lines.append(_row("next", f"slip inspect {shlex.quote(log)}"))
-    if stored.get("undecided"):
-        lines.append(_row("next", f"slip plan {name}{said}    the drive that tells what is undecided"))
+    if plan is not None:
+        lines.append(_row("next", f"slip plan {name}{said}{plan}    the drive that tells what is undecided"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

@@ -82,12 +82,15 @@ def plan(  # noqa: D417 - the runs document themselves
         driven = api.check_drive(check, names, options, opened=opened, progress=progress)
         home = (check if check.is_dir() else check.parent).resolve()
         said += spell_flags({"folder": f"{home.name}_next"})
-        following = f"slip plan {shlex.join(dict.fromkeys([*driven.earlier, *names]))}{said}"
+        following = None
+        if driven.following is not None:
+            together = shlex.join(dict.fromkeys([*driven.earlier, *names]))
+            following = f"slip plan {together}{driven.following}{said}"
         if json:
-            checked, following_up = driven.checked, following if driven.is_open else None
-            print_json({"kept": checked.outcomes, "open": checked.open, "next": following_up, "errors": []})
+            checked = driven.checked
+            print_json({"kept": checked.outcomes, "open": checked.open, "next": following, "errors": []})
         elif not quiet:
-            print_lines([*driven.describe(), *([f"next      {following}"] if driven.is_open else [])])
+            print_lines([*driven.describe(), *([f"next      {following}"] if following else [])])
         return LOSSY if driven.lossy else CLEAN
     require_new(*api.list_plan_files(folder), force=force)
     made = api.plan_drive(

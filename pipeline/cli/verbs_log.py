@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline import models, store, words
+from pipeline import api, models, store, words
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
@@ -42,6 +42,7 @@ from pipeline.core import (
     format_section,
     format_share,
     format_size,
+    mapping_in,
     name_first,
     name_install,
     shorten,
@@ -124,12 +125,15 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         said = spell_choices(choices)
         for one in outcomes:
             is_same = not one.computed
+            is_open = bool(mapping_in(one.summary, "diagnosis").get("undecided"))
+            plan = api.suggest_plan(str(one.summary["run"]), options) if is_open else None
             text = format_run(
                 one.summary,
                 unchanged=is_same,
                 twin=one.twin,
                 replaced=one.replaced,
                 said=said,
+                plan=plan,
                 everything=everything,
             )
             print_lines(text.splitlines())

@@ -27,7 +27,7 @@ from pipeline.estimation.model_state import flatten
 from pipeline.estimation.noise import Noise
 from pipeline.models import Effect, Largest, Model, Timing, list_effects
 from pipeline.plan.manoeuvres import Commands, PlanError, is_steered
-from pipeline.results import RunDiagnosis, find_refusal
+from pipeline.results import RunDiagnosis, find_refusal, read_model
 from pipeline.run import Alignment, DriveSeries, MotionRun, Track
 from pipeline.sources import Vehicle
 from pipeline.words import format_finding
@@ -79,23 +79,27 @@ class Studied:
 
 
 def study(
-    recordings: Sequence[DiagnosisInput], vehicle: Vehicle, notify: Callable[[str], None] | None = None
+    recordings: Sequence[DiagnosisInput],
+    vehicle: Vehicle,
+    notify: Callable[[str], None] | None = None,
+    known: RunDiagnosis | None = None,
 ) -> Studied:
-    """Diagnose runs jointly, and fit the effects that the diagnosis identified beyond doubt.
+    """Fit the effects that the joint diagnosis of runs identified beyond doubt.
 
     Args:
         recordings: runs of one vehicle.
         vehicle: the vehicle.
         notify: called with what is being done.
+        known: their diagnosis, where it was made before.
 
     Raises:
         SlipError: nothing can be estimated, or a run has no commands.
     """
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
 
-    joint = diagnose_runs(recordings, vehicle, notify=notify)
-    diagnosis, where = joint.runs[0], recordings[0].name
-    if joint.proposal is None:
+    diagnosis = known or diagnose_runs(recordings, vehicle, notify=notify).runs[0]
+    proposal, where = read_model(diagnosis), recordings[0].name
+    if proposal is None:
         refusal = find_refusal(diagnosis.findings)
         why = "the log cannot be judged" if refusal is None else format_finding(refusal)
         what = f"{why}, so that nothing can be planned from it"
@@ -113,8 +117,8 @@ def study(
     data = EstimationData(runs, vehicle, Input.COMMAND)
     usable = {effect.id for effect in list_effects()}
     usable -= {name for group in diagnosis.undecided for name in group.candidates}
-    known = tuple(effect for effect in joint.proposal.model.effects if effect.id in usable)
-    return Studied(data.vehicle, diagnosis, fit_model(data, Model(data.vehicle, known)))
+    certain = tuple(effect for effect in proposal.model.effects if effect.id in usable)
+    return Studied(data.vehicle, diagnosis, fit_model(data, Model(data.vehicle, certain)))
 
 
 class Rehearsal:

@@ -13,6 +13,7 @@ from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, FEWEST_STEPS, Motion, compare, fit, measure_share
 from pipeline.recording.outages import turns_about
 from pipeline.recording.readings import SIDES, Held
+from pipeline.recording.topic_values import FEWEST_MESSAGES
 from pipeline.sources import DriveForm, DriveSection
 
 _FOLLOWS = 0.5
@@ -271,11 +272,27 @@ def _report_sides(case: Case) -> bool:
 
 
 def _report_dead(case: Case) -> bool:
-    """Whether the encoder of a side is dead, which is told: it may stand where the body turns about it."""
-    dead = case.wheels.reading.dead_side
-    if not dead or (case.has_pose and turns_about(dead, case.motion, case.track_m)):
+    """Whether the encoder of a side is dead or silent, which is told."""
+    counts = _count_messages(case)
+    # Of a topic with hardly any messages nothing is known between them, whatever they say.
+    silent = [side for side, count in counts.items() if count < FEWEST_MESSAGES]
+    dead = silent[0] if len(silent) == 1 else case.wheels.reading.dead_side
+    stands = not silent and case.has_pose and turns_about(dead, case.motion, case.track_m)
+    if not dead or stands:
         return False
     other = next(side for side in SIDES if side != dead)
     values = {"side": dead, "other": other, "has_pose": case.has_pose}
+    if silent:
+        values |= {"messages": counts[dead], "of_other": counts[other]}
     case.findings.append(Finding("wheel_dead", "error", f"wheels {dead}", values))
     return True
+
+
+def _count_messages(case: Case) -> dict[str, int]:
+    """Messages of each side that has a topic of its own; empty where both have the same."""
+    source = case.wheels.source
+    topics = [signal.topic for signal in source.signals]
+    if len(set(topics)) != len(SIDES):
+        return {}
+    columns = case.extraction.columns
+    return {side: columns[topic].log_time.size for side, topic in zip(SIDES, topics, strict=True)}

@@ -790,7 +790,9 @@ def _find_silent(at: Stamps, stamps: Stamps, values: Floats) -> Flags:
     After a reading of zero a wheel may stand whose changes alone are published.
     """
     steps = np.diff(stamps)
-    longest = max(_LONGEST_STEP_S * 1e9, PERIODS * float(np.quantile(steps, 0.75))) if steps.size else np.inf
+    if not steps.size:
+        return np.zeros(at.size, dtype=bool)
+    longest = max(_LONGEST_STEP_S * 1e9, PERIODS * float(np.quantile(steps, 0.75)))
     last = np.searchsorted(stamps, at, side="right") - 1
     before = np.clip(last, 0, steps.size - 1)
     return np.asarray(

@@ -1062,6 +1062,12 @@ def _wheel_dead(of: Values) -> str:
     rest = "the log holds no pose that could take its place"
     if of["has_pose"]:
         rest = f"take --input command, or correct [wheels] {of['side']}"
+    if "messages" in of:
+        return (
+            f"the {of['side']} wheels' encoder is silent: {format_count(of['messages'], 'message')} of it "
+            f"{'is' if of['messages'] == 1 else 'are'} recorded, {of['of_other']} of the {of['other']} "
+            f"wheels' ({rest})"
+        )
     return (
         f"the {of['side']} wheels' encoder reads the same throughout while the {of['other']} wheels turn: it "
         f"is dead ({rest})"

@@ -11,6 +11,11 @@ from plan_game import record
 from scipy.special import stdtrit
 from verbs import run_verb
 
+import slip
+from pipeline.analysis import Options
+from pipeline.api import suggest_plan
+from pipeline.cli.screen import format_run
+from pipeline.estimation.stored_diagnosis import read_stored_diagnosis
 from pipeline.models import Largest, Number, find_effect
 from pipeline.plan import (
     PlanError,
@@ -153,6 +158,24 @@ def _run(*arguments: str | Path, code: int = 0) -> str:
     done = run_verb(*arguments)
     assert done.returncode == code, done.stderr
     return done.stdout if code == 0 else done.stderr
+
+
+@pytest.mark.parametrize(
+    ("candidates", "flags"), [(("body_inertia", "lateral_skid"), ""), (("slope_creep", "slope_slip"), None)]
+)
+def test_a_plan_is_the_next_step_only_where_its_drive_decides(
+    stored_run: Path, monkeypatch: pytest.MonkeyPatch, candidates: tuple[str, ...], flags: str | None
+) -> None:
+    results = stored_run / "results"
+    run = slip.load("field/wide", results=results)
+    stored = read_stored_diagnosis(run.manifest)
+    assert stored is not None
+    is_open = msgspec.structs.replace(stored, undecided=(Undecided(candidates),))
+    monkeypatch.setattr("pipeline.api.drives.find_diagnosis", lambda *_: is_open)
+    suggested = suggest_plan("field/wide", Options(out=results))
+    assert suggested == flags
+    screen = format_run(run.summary, unchanged=False, plan=suggested)
+    assert ("slip plan field/wide    the drive" in screen) == (flags is not None)
 
 
 @pytest.mark.long

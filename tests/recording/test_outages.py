@@ -131,6 +131,21 @@ def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> No
         assert "encoder_dead" not in {one.id for one in settled.choice.findings}
 
 
+@pytest.mark.parametrize(("count", "said"), [(1, "1 message of it is"), (3, "3 messages of it are")])
+def test_an_encoder_with_hardly_any_message_is_silent_whatever_it_says(
+    count: int, said: str, tmp_path: Path
+) -> None:
+    drive = draw(26)
+    wheels = sides(drive)
+    rows = np.linspace(2, wheels.second.times.size - 5, count).astype(int)
+    for shown in (wheels.second.values, np.zeros(wheels.second.values.size)):
+        few_read = replace(wheels, second=Held(wheels.second.times[rows], shown[rows]))
+        log = write_log(tmp_path / "log.mcap", drive, wheels=few_read)
+        findings = set_up_log(log, Options(out=tmp_path)).choice.findings
+        (told,) = [format_finding(one) for one in findings if one.id == "wheel_dead"]
+        assert f"the right wheels' encoder is silent: {said} recorded" in told
+
+
 @pytest.mark.parametrize("name", few(["left encoder dies", "right encoder holds"], 2))
 def test_an_encoder_of_mecanum_wheels_dies_beside_a_body_that_is_commanded(name: str, tmp_path: Path) -> None:
     log = simulate_platform("dingo_o", {}, out=tmp_path / "log.mcap", seed=5, duration_s=100.0)
