@@ -277,8 +277,7 @@ def _report_dead(case: Case) -> bool:
     # Of a topic with hardly any messages nothing is known between them, whatever they say.
     silent = [side for side, count in counts.items() if count < FEWEST_MESSAGES]
     dead = silent[0] if len(silent) == 1 else case.wheels.reading.dead_side
-    stands = not silent and case.has_pose and turns_about(dead, case.motion, case.track_m)
-    if not dead or stands:
+    if not dead or (not silent and case.has_pose and turns_about(dead, case.motion, case.track_m)):
         return False
     other = next(side for side in SIDES if side != dead)
     values = {"side": dead, "other": other, "has_pose": case.has_pose}
