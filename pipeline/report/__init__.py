@@ -468,8 +468,8 @@ def _date_errors(rows: Sequence[Mapping[str, object]]) -> dict[str, object] | No
     """Errors over 2 s over the dates of runs, as shares of a figure's width and height; None for one date.
 
     Returns:
-        ``points``; ``heights`` and ``dates``, the labels of both axes by their shares; and ``vehicles`` by the
-        number of their colour, those with the most runs first.
+        ``points``; ``heights`` and ``dates``, the labels of both axes by their shares; and ``vehicles`` by
+        the number of their colour, those with the most runs first.
     """
     known = [
         (date.fromisoformat(str(row["day"])).toordinal(), ideal, model, row)
