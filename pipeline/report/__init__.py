@@ -16,6 +16,7 @@ import math
 import os
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
@@ -31,6 +32,7 @@ from pipeline.core import (
     LONGEST_TEXT,
     SlipError,
     find_existing,
+    format_count,
     format_part,
     format_share,
     mapping_in,
@@ -463,24 +465,65 @@ def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, 
 
 
 def _date_errors(rows: Sequence[Mapping[str, object]]) -> dict[str, object] | None:
-    """Errors over 2 s over the dates of runs, as shares of a figure's width and height; None for one date."""
+    """Errors over 2 s over the dates of runs, as shares of a figure's width and height; None for one date.
+
+    Returns:
+        ``points``; ``heights`` and ``dates``, the labels of both axes by their shares; and ``vehicles`` by
+        the number of their colour, those with the most runs first.
+    """
     known = [
-        (date.fromisoformat(str(row["day"])).toordinal(), ideal, model, str(row["run"]))
+        (date.fromisoformat(str(row["day"])).toordinal(), ideal, model, row)
         for row in rows
         if row["day"]
         and isinstance(ideal := row["ideal"], float)
         and isinstance(model := row["model"], float)
+        and math.isfinite(ideal + model)
     ]
-    if len({day for day, *_ in known}) < 2:  # noqa: PLR2004 - dates have an order from two on
+    days = sorted({day for day, *_ in known})
+    if len(days) < 2:  # noqa: PLR2004 - dates have an order from two on
         return None
-    first, last = min(known)[0], max(known)[0]
     most = max(max(ideal, model) for _, ideal, model, _ in known) or 1.0
+    step = next(step for step in _list_steps() if step * _MOST_HEIGHTS >= most)
+    top, span = step * math.ceil(most / step), days[-1] - days[0]
+    counts = Counter(str(row["vehicle"] or _NO_VEHICLE) for *_, row in known)
+    vehicles = [name for name, _ in sorted(counts.items(), key=lambda item: (-item[1], item[0]))]
+    others = min(len(vehicles), _COLOURS)
+    numbers = {name: min(number, others) for number, name in enumerate(vehicles)}
+    labels = vehicles[:others]
+    if len(vehicles) > others:
+        labels.append(format_count(len(vehicles) - others, "other vehicle"))
     points = [
-        {"x": (day - first) / (last - first), "ideal": ideal / most, "model": model / most, "run": run}
-        for day, ideal, model, run in sorted(known)
+        {
+            "x": (day - days[0]) / span,
+            "ideal": ideal / top,
+            "model": model / top,
+            "run": str(row["run"]),
+            "vehicle": (number := numbers[str(row["vehicle"] or _NO_VEHICLE)]),
+            # Vehicles of one day stand side by side.
+            "shift": round(_APART_PX * (number - (len(labels) - 1) / 2), 1),
+        }
+        for day, ideal, model, row in sorted(known, key=lambda one: (one[0], str(one[3]["run"])))
     ]
-    ends = [date.fromordinal(day).isoformat() for day in (first, last)]
-    return {"points": points, "first": ends[0], "last": ends[1], "most": format_number(most)}
+    marked = sorted({0, span // 2, span})
+    return {
+        "points": points,
+        "heights": {number * step / top: f"{number * step:g}" for number in range(round(top / step) + 1)},
+        "dates": {day / span: date.fromordinal(days[0] + day).isoformat() for day in marked},
+        "vehicles": labels,
+    }
+
+
+_MOST_HEIGHTS = 4
+_COLOURS = 6
+"""Vehicles with a colour of their own in the catalogue's style; the others share one."""
+_APART_PX = 6.0
+_NO_VEHICLE = "unknown vehicle"
+
+
+def _list_steps() -> Iterator[float]:
+    """Steps between the labels of an axis."""
+    for exponent in range(-6, 300):
+        yield from (digit * 10.0**exponent for digit in (1, 2, 5))
 
 
 def _list_cells(row: Mapping[str, object], numbers: Sequence[str]) -> Iterator[tuple[Column, object, object]]:

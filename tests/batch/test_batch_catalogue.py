@@ -16,7 +16,7 @@ FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--dis
 
 PROBE = """
 const names = () => [...document.querySelectorAll("tbody tr")].filter((row) => !row.hidden)
-  .map((row) => row.cells[0].textContent.replace(" no report: slip analyze LOG", ""));
+  .map((row) => row.cells[0].firstChild.textContent.trim());
 const click = (title) => [...document.querySelectorAll("thead button")]
   .find((button) => button.textContent.startsWith(title)).click();
 const type = (text) => {

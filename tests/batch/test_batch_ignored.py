@@ -123,11 +123,17 @@ def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> 
     assert pytest.approx(steps[-1]) in shown
     assert "<figure>" not in page, "one date has no course"
     rows = [
-        {"run": f"r{day}", "day": f"2026-05-0{day}", "ideal": 0.5 * day, "model": 0.1} for day in (1, 2, 4)
+        {"run": f"r{day}", "day": f"2026-05-0{day}", "vehicle": name, "ideal": 0.5 * day, "model": 0.1}
+        for day, name in ((1, "husky"), (2, "jackal"), (4, "jackal"))
     ]
     dated = _date_errors(rows)
     assert dated is not None
-    assert (dated["first"], dated["last"], dated["most"]) == ("2026-05-01", "2026-05-04", "2.00")
+    assert list(dated["dates"].values()) == ["2026-05-01", "2026-05-02", "2026-05-04"]
+    assert dated["heights"] == {0.0: "0", 0.25: "0.5", 0.5: "1", 0.75: "1.5", 1.0: "2"}
+    assert dated["vehicles"] == ["jackal", "husky"]
+    assert [one["vehicle"] for one in dated["points"]] == [1, 0, 0]
+    many = [{**row, "vehicle": f"robot {number}"} for number in range(8) for row in rows]
+    assert _date_errors(many)["vehicles"] == [*(f"robot {number}" for number in range(6)), "2 other vehicles"]
     assert [one["x"] for one in dated["points"]] == pytest.approx([0.0, 1 / 3, 1.0])
     assert [one["ideal"] for one in dated["points"]] == pytest.approx([0.25, 0.5, 1.0])
 
