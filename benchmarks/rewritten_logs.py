@@ -557,7 +557,7 @@ def _read_sides(log: Log, roles: Roles) -> dict[str, tuple[Any, Any]] | None:
     for one in log.messages:
         if one.topic not in roles.wheels:
             continue
-        if hasattr(one.content, "velocity"):
+        if hasattr(one.content, "name"):
             speeds = dict(zip(one.content.name, one.content.velocity, strict=False))
         else:
             speeds = {one.topic: getattr(one.content, "data", None)}

@@ -27,10 +27,10 @@ from pipeline.store import (
     StoreError,
     add_digits,
     hash_json,
+    make_distinct,
     path_unread,
     recorded_path,
     see_log,
-    tell_apart,
 )
 from schemas import contract_of, list_contracts
 
@@ -144,7 +144,7 @@ def name_runs(
     twins = {path: first.setdefault(hashes.get(path) or str(path), path) for path in rest}
     locations |= {run: path for path, run in runs.items()}
     fresh = [path for path in rest if twins[path] == path and path not in earlier]
-    names = tell_apart({path: name_listed(path) for path in (*locations.values(), *others, *fresh)})
+    names = make_distinct({path: name_listed(path) for path in (*locations.values(), *others, *fresh)})
     for path in rest:
         if twins[path] != path:
             copies[path] = runs[twins[path]]
