@@ -128,6 +128,12 @@ def _describe_usage(error: CycloptsError) -> str:
     """What is wrong with the words of a command; for a missing argument its name and meaning."""
     verb = f"slip {' '.join(error.command_chain or ())}".rstrip()
     rest = " ".join(error.unused_tokens or ())
+    if (
+        isinstance(error, UnknownCommandError)
+        and error.unused_tokens
+        and Path(error.unused_tokens[0]).exists()
+    ):
+        return f"slip has no command {error.unused_tokens[0]}. A log is analyzed by: slip analyze {rest}"
     if isinstance(error, UnusedCliTokensError):
         return f"{verb} takes no further argument: {rest}. See {verb} --help."
     if isinstance(error, UnknownCommandError) and rest.split()[:1] in _VERSION_WORDS:

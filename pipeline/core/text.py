@@ -317,7 +317,7 @@ def format_size(count: float) -> str:
 def format_duration(seconds: float) -> str:
     """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
     if seconds < _MINUTE:
-        return f"{round(seconds, 1):g} s"
+        return f"{round(seconds, 1) or float(f'{seconds:.1g}'):g} s"
     whole = round(seconds)
     if whole < _HOUR:
         return f"{whole // 60} min {whole % 60:02d} s"

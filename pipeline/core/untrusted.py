@@ -381,13 +381,13 @@ def read_bounded(path: Path) -> bytes:
 
 
 def read_bounded_text(path: Path) -> str:
-    """The content of such a file as text.
+    """The content of such a file as text, without the mark that editors put before UTF-8.
 
     Raises:
         OSError: as `read_bounded`.
         UnicodeDecodeError: it is not UTF-8.
     """
-    return read_bounded(path).decode()
+    return read_bounded(path).decode("utf-8-sig")
 
 
 def read_object(path: Path) -> dict[str, object]:

@@ -9,7 +9,15 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from pipeline.core import SlipError, TomlError, number_in, parse_toml, read_bounded_text, shorten
+from pipeline.core import (
+    SlipError,
+    TomlError,
+    enumerate_texts,
+    number_in,
+    parse_toml,
+    read_bounded_text,
+    shorten,
+)
 from pipeline.models.catalogue import find_effect, refuse_taken
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
@@ -248,7 +256,17 @@ class _Reader:
                 Model(vehicle, tuple(effects))
             except MotionError as error:
                 raise self._repeat(error, ("effect", number), "id") from error
+            self._require_number(("effect", number), table, effects[-1])
         return effects
+
+    def _require_number(self, at: tuple[str, int], table: Table, effect: Effect) -> None:
+        """Refuse an effect without any of its numbers, which would change nothing."""
+        names = [one.name for one in effect.parameters]
+        if names and not {*names} & {*table}:
+            example = f"{names[0]} = {effect.parameters[0].typical:g}"
+            hint = f"Write {enumerate_texts(names)}, as {example}; slip model fit estimates what is there."
+            what = f"the effect {effect.id} has no number"
+            raise self._error(what, hint, at, "id", code="no_number")
 
     def _vehicle(self) -> Vehicle:
         table = self.tree.get("vehicle")

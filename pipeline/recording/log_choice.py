@@ -311,13 +311,14 @@ def _choose_readable(
     recorded = find_preset(index.deployment.get("vehicle") or "")
     witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
     findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
-    if sources.command is None and sources.wheels is not None and sources.pose is not None:
-        findings.append(Finding("no_command", "info", "command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     chosen = _choose_pose(chosen, channels, index, configuration)
+    taken = chosen.sources
+    if taken.command is None and taken.wheels is not None and taken.pose is not None:
+        finding = Finding("no_command", "info", "command")
+        chosen = replace(chosen, findings=(*chosen.findings, finding))
     # The content may leave no drive: what was chosen by name is a drive all the same.
-    pose = chosen.sources.pose
-    fits = problem is not None and pose is not None and (sources.wheels or sources.command) is not None
+    fits = problem is not None and taken.pose is not None and (sources.wheels or sources.command) is not None
     # Missing data are reported before an unknown vehicle.
     if problem is None or not fits:
         return chosen

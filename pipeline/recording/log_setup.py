@@ -164,10 +164,12 @@ def require_sources(chosen: Choice, index: LogIndex, options: LogOptions) -> Non
         roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
         what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
         named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
-        is_there = _may_be_named(index, "drive", "number", "numbers", "joints")
-        unused = [
-            f"not used: {one.values['what']}" for one in chosen.findings if one.id == "numbers_not_used"
-        ]
+        findings = [one for one in chosen.findings if one.id == "numbers_not_used"]
+        unused = [f"not used: {one.values['what']}" for one in findings]
+        # These have lines of their own, or are no drive by their content.
+        unusable = {one.where for one in findings}
+        rest = tuple(one for one in index.channels if one.topic not in unusable)
+        is_there = _may_be_named(replace(index, channels=rest), "drive", "number", "numbers", "joints")
         named = ". ".join([*(unused or [_RECORD_DRIVE]), *([named] if is_there else [])])
         hint = f"{named[0].upper()}{named[1:]}. The log has: {there}."
         raise RecordingError("no_command", what, where=str(index.path), hint=hint)

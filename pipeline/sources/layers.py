@@ -76,6 +76,8 @@ def convert_to(kind: type[Section], tree: Tree) -> Section | Fault:
         wanted, got = mismatch.groups() if (mismatch := _MISMATCH.search(message)) else ("", "")
         if wanted.startswith("object") and steps:
             hint = f"Write it as a section, [{'.'.join(steps)}], with its keys below."
+        elif (wanted, got) == ("array", "object") and steps:
+            hint = f"Write [[{'.'.join(steps)}]], with two brackets: there may be several."
         elif got == "str" and wanted.startswith(("float", "int")):
             hint = "Write the number without quotes."
     return Fault(shorten(_readable(message)), hint, [step for step in steps if step != "["], value)

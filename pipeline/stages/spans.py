@@ -448,7 +448,8 @@ def _compare_command(
             findings.append(Finding("commanded_otherwise", "warning", "command", values))
         elif keeps is not None and keeps.total - fit.total > blocks.price:
             fit, asked = keeps, asked + last
-            values = {"value": longest, "count": len(pauses)}
+            whole = math.ceil(10.0 * ((hold_s or 0.0) + longest) + 1.0) / 10.0
+            values = {"value": longest, "count": len(pauses), "hold_s": whole}
             findings.append(Finding("kept_command", "warning", "command", values))
         elif hold_s is not None:
             spans += _list_silent(rims, blocks, fit, asked + last, pauses, hold_s)

@@ -518,9 +518,9 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "commanded_otherwise": "in {count} pauses of the command, of up to {value:.1f} s, the vehicle moves "
     "otherwise than by its last one: another topic or a remote control commands it there, and these "
     "stretches are left out",
-    "kept_command": "in {count} pauses the vehicle continues its last command until the next, for up to "
-    "{value:.1f} s beyond command.hold_s: the base holds its last command; set command.hold_s to the longest "
-    "pause to include these stretches",
+    "kept_command": "in pauses of the commands ({count}, of up to {value:.1f} s beyond command.hold_s) the "
+    "vehicle continues its last command until the next: the base holds its last command; hold_s = {hold_s:g} "
+    "under [command] in run.toml includes these stretches",
     "stopped": "the vehicle stood still under live commands: an emergency stop, or a drive that was off, "
     "blocked or too weak to move it; left out of all fits",
     "side_stopped": "the wheels of one side stood under live commands: one was stuck, or its motor off; left "
@@ -784,11 +784,11 @@ def _name_alike(of: Values) -> str:
         return ""
     if of["has_track_of_alike"]:
         first, called = next(iter(alike.items()))
-        return f" ({called} has about these: confirm with --vehicle {first})"
+        return f" (a {called} has about these: if it is one, give --vehicle {first})"
     turns = f"turns at {format_share(of['turns'])} of the ideal rate"
     return (
-        f" ({' or '.join(alike.values())} has such wheels, and then {turns}: confirm with --vehicle "
-        f"{' or '.join(alike)})"
+        f" (if it is a {' or '.join(alike.values())}, which has such wheels, it {turns}: give --vehicle "
+        f"{' or '.join(alike)}; else pass this by)"
     )
 
 
@@ -821,6 +821,8 @@ _FAULTS_OF_SIGNS = {
 _REMEDIES = {
     "pose_backward": " (heading_deg = 180 under [pose] in run.toml)",
     "pose_mirrored": ' (up = "-z" under [pose] in run.toml)',
+    "command_turned": ', which is to be corrected on the robot (up = "-z" under [pose] in run.toml reads '
+    "this log all the same, with left and right exchanged)",
     "wheels_both": " (sign = -1 under [wheels] in run.toml)",
     "wheels_exchanged": " (exchanged = true under [wheels] in run.toml)",
     "wheels_exchanged_both": " (sign = -1 and exchanged = true under [wheels] in run.toml)",

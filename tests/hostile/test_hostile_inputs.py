@@ -178,6 +178,7 @@ USAGE = (
 USAGE_WORDS = {
     "version": r"slip has no command version\. The version is shown by slip --version",
     "-v": r"shown by slip --version",
+    "field/wide.mcap": r"no command field/wide\.mcap\. A log is analyzed by: slip analyze field/wide\.mcap",
     "analyze log.mcap --rate 3": r"slip analyze has no option --rate\. See slip analyze --help",
     "analyze log.mcap --vehicel x": r"no option --vehicel\. Did you mean --vehicle\? See",
 }
@@ -194,7 +195,8 @@ MODELS = [
     (HEAD + TRACK + 'k = { value = 1.5, unit = "m" }\n', "5: .*is in 1, not in m"),
     (HEAD + TRACK + "k = inf\n", "5: .*not a finite number"),
     (HEAD + TRACK + "k = { value = -nan }\n", "5: .*not a finite number"),
-    (HEAD + TRACK + TRACK, "6: .*twice"),
+    (HEAD + TRACK, r"4: .*effective_track has no number.*Write k, as k = 1\.\d"),
+    (HEAD + 2 * (TRACK + "k = 1.5\n"), "7: .*twice"),
     (HEAD + '[[effect]]\nid = "effective_truck"\n', "4: .*no effect is called"),
     (HEAD + '[[effect]]\nid = "understeer"\n', "4: .*ackermann vehicles only"),
     (HEAD + '[[effect]]\nid = "two\\nlines"\n', "4: .*id of an effect"),

@@ -138,6 +138,10 @@ def test_a_base_that_keeps_its_last_command_is_not_driven_by_hand() -> None:
     pauses = sparse["commands"]["t"].diff().drop_nulls().to_numpy()
     assert kept.value == pytest.approx(np.max(pauses) - 0.5, abs=1.0)
     assert not [one for one in findings if one.id in INCIDENTS]
+    # The line that it offers leaves nothing out.
+    assert f"hold_s = {kept.values['hold_s']:g} under [command]" in format_finding(kept)
+    again = pass_stages(sparse, HUSKY, hold_s=kept.values["hold_s"])[1].findings
+    assert not {"kept_command", "stale_command"} & {one.id for one in again}
 
 
 def test_a_command_whose_topic_changes_is_not_kept_by_the_base() -> None:

@@ -549,6 +549,7 @@ def test_joints_of_legs_are_no_wheels(kind: str, tmp_path: Path) -> None:
     with pytest.raises(SlipError, match=r"command or measured wheels.*joints swing") as caught:
         set_up(tmp_path, record_legs(robot, kind), robot.pose())
     assert caught.value.code == "no_command"
+    assert "Name it" not in str(caught.value)
 
 
 def test_wheels_that_go_back_and_forth_are_no_legs(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.sources import load_configuration, merge
+from pipeline.sources import ConfigurationError, load_configuration, merge
 
 Write = Callable[[str, str], Path]
 
@@ -82,6 +82,17 @@ def test_a_recording_that_is_a_folder_has_its_configuration_beside_it_or_in_it(w
     write("2026/bag/run.toml", '[run]\nterrain = "inside"\n')
     found = load_configuration(folder)
     assert (found.run.terrain, found.run.dataset) == ("inside", "beside")
+
+
+def test_a_mark_before_the_text_is_none_of_it(log: Path, write: Write) -> None:
+    write("2026/monday/run.toml", '\ufeff[run]\nterrain = "ice"\n')
+    assert load_configuration(log).run.terrain == "ice"
+
+
+def test_an_interval_in_single_brackets_is_told_how_it_is_written(log: Path, write: Write) -> None:
+    write("2026/monday/run.toml", "[interval]\nstart_s = 10\n")
+    with pytest.raises(ConfigurationError, match=r"line 1.*a list belongs there.*Write \[\[interval\]\]"):
+        load_configuration(log)
 
 
 def test_a_given_file_stands_in_for_the_one_beside_the_log(log: Path, write: Write) -> None:
