@@ -32,10 +32,10 @@ from pipeline.results import (
     Step,
     Undecided,
     Unexplained,
-    format_rises,
     is_small,
     key_finding,
     list_added,
+    list_rises,
     measure_excess,
     split_main,
 )
@@ -57,6 +57,7 @@ from pipeline.words.errors import (
     describe_moments,
     describe_need,
     describe_regions,
+    describe_rises,
     describe_unexplained,
     format_fall,
     format_remaining_error,
@@ -221,11 +222,25 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     for item in felt:
         texts.append(f"Undecided: {name_group(item.candidates)}")
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
+    texts += _list_raising(run)
     counts = [f"{folded} smaller effect{'s' * (folded > 1)}"] if folded else []
     counts += [f"{len(small)} undecided"] if small else []
     if counts:
         texts.append(f"{', and '.join(counts)} (--all)")
     return texts
+
+
+def _list_raising(run: RunDiagnosis) -> list[str]:
+    """The named effects that raise an error over 2 s and lower none."""
+    named = {effect.id for effect in run.effects}
+    return [
+        f"{name_term(name)} {describe_rises(before, after)}: it is named because the motion over "
+        "shorter times is more likely with it"
+        for before, after in pairwise(run.ladder)
+        if list_rises(before, after, CHANCE) and not list_rises(after, before, CHANCE)
+        for name in list_added(before, after)
+        if name in named
+    ]
 
 
 def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
@@ -543,13 +558,14 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     """Changes of the errors at the ladder step of each effect, and by how much one of them rises."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
+        rising = list_rises(before, after, CHANCE)
         falling = [
             text
             for key in ERRORS_OVER_2S
-            if (text := format_fall(getattr(before, key), getattr(after, key), key)) is not None
+            if key not in rising
+            and (text := format_fall(getattr(before, key), getattr(after, key), key)) is not None
         ]
-        visible, rises = ", ".join(filter(None, falling)), format_rises(before, after, CHANCE)
-        text = f"{visible} ({rises})" if visible and rises else visible or rises
+        text = "; ".join(filter(None, [", ".join(filter(None, falling)), describe_rises(before, after)]))
         for name in list_added(before, after):
             falls[name] = text or (_UNCHANGED if falling else "")
     return falls

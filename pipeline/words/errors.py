@@ -19,6 +19,7 @@ from pipeline.core import (
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
+    CHANCE,
     ERRORS_OVER_2S,
     INTERVAL_SHARE,
     Errors,
@@ -29,6 +30,7 @@ from pipeline.results import (
     Stretch,
     Unexplained,
     list_excess,
+    list_rises,
 )
 from pipeline.run import HORIZON_S
 
@@ -127,6 +129,16 @@ def format_excess(ratio: float) -> str:
     """A remaining error in times the noise floor: `at`, `1.6 times`."""
     text = format_digits(ratio)
     return f"{text} times" if float(text) >= _KNOWN_TO else "at"
+
+
+def describe_rises(before: Step, after: Step) -> str:
+    """`raises the heading error from 4.3 to 5.3 degrees`; empty where none rises by more than chance."""
+    phrases = []
+    for key in list_rises(before, after, CHANCE):
+        fall = format_fall(getattr(before, key), getattr(after, key), key)
+        by = f" from {fall.replace(' -> ', ' to ')}" if fall else ""
+        phrases.append(f"the {ERRORS_OVER_2S[key][0]} error{by}")
+    return f"raises {enumerate_texts(phrases)}" if phrases else ""
 
 
 def format_fall(old: float, new: float, key: str) -> str | None:

@@ -186,3 +186,21 @@ def test_a_share_is_rounded_once(k: float, half: float, share: str) -> None:
     drawn = draw_diagnosis({"effective_track": {"k": k}}, [(1.0, 1.0), (0.5, 0.3)])
     known = replace(drawn.effects[0], parameters={"k": Number(k, k - half, k + half)})
     assert describe_clause(known, drawn) == f"turns at {share} of the ideal rate"
+
+
+def test_an_effect_that_only_raises_errors_is_said_to_do_so() -> None:
+    drawn = draw_diagnosis(
+        {"effective_track": {"k": 1.8}, "drive_lag": {"tau": 0.3}, "turn_lag": {"tau_diff": 0.3}},
+        [(1.0, 1.0), (0.5, 0.3), (0.35, 0.199), (0.362, 0.211)],
+    )
+    texts = [text for _, text in list_lines(drawn)]
+    said = [text for text in texts if "raises" in text]
+    (line,) = said
+    assert line == (
+        "turning lag raises the position error from 35 to 36 cm and the heading error from 11 to 12 degrees: "
+        "it is named because the motion over shorter times is more likely with it"
+    )
+    better = replace(drawn, ladder=(*drawn.ladder[:3], replace(drawn.ladder[3], t_mrmse_m=0.3)))
+    assert not [text for _, text in list_lines(better) if "raises" in text]
+    everything = " ".join(text for _, text in list_lines(better, everything=True))
+    assert "35 -> 30 cm; raises the heading error from 11 to 12 degrees" in everything
