@@ -5,14 +5,14 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from pipeline import plan as planning
 from pipeline.analysis import Options
 from pipeline.api.opening import Opener, Progress, open_quietly, show_nothing
-from pipeline.core import SlipError, format_count, format_duration
+from pipeline.core import SlipError, format_count, format_duration, name_first
 from pipeline.estimation import DiagnosisInput, diagnose_runs, load_recording
 from pipeline.estimation.stored_diagnosis import find_diagnosis, read_recording
 from pipeline.plan import SAFETY, CheckedPlan, Plan
@@ -37,6 +37,7 @@ class PlannedDrive:
         lossy: whether one of them had losses.
         report: the report that shows it; None without one.
         warning: why the report of the run does not show it; empty without a reason.
+        recorded: topics of the recorded commands, where the plan's is none of them.
     """
 
     plan: Plan
@@ -45,6 +46,7 @@ class PlannedDrive:
     lossy: bool = False
     report: Path | None = None
     warning: str = ""
+    recorded: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, object]:
         """The object of `slip plan --json`."""
@@ -85,10 +87,18 @@ class PlannedDrive:
             ),
             most,
             f"play         ros2 bag play {files[2]}    # {made.type_name} on {made.topic}",
+            *self._describe_topic(),
             f"page         {files[-1]}",
             *(f"safety       {text}" for text in SAFETY),
             f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",
         ]
+
+    def _describe_topic(self) -> list[str]:
+        """That no log holds commands on the topic of the plan."""
+        if not self.recorded:
+            return []
+        text = f"the log holds no commands on {self.plan.topic}, those are on {name_first(self.recorded)}"
+        return [f"topic        {text}: --topic names the one that the base obeys"]
 
 
 def list_plan_files(folder: Path) -> list[Path]:
@@ -159,15 +169,25 @@ def plan_drive(
         played = (topic or usual[0], type_name or usual[1])
         made = planning.make_plan(studied, limits, ground, seconds, played, notify)
     files = write_drive(made, folder, options.out)
-    if gathered is None or len(gathered.manifests) != 1:
-        return PlannedDrive(made, files, studied.driven_s, gathered is not None and gathered.lossy)
+    if gathered is None:
+        return PlannedDrive(made, files, studied.driven_s)
+    commands = {name: None for one in gathered.manifests for name in planning.list_commands(one)}
+    drive = PlannedDrive(
+        made,
+        files,
+        studied.driven_s,
+        gathered.lossy,
+        recorded=() if played[0] in commands else tuple(commands),
+    )
+    if len(gathered.manifests) != 1:
+        return drive
     # The plan of one stored run is shown with it.
     report, warning = None, ""
     try:
         report = leave_plan(Store(options.out), gathered.manifests[0], made)
     except (SlipError, OSError) as error:
         warning = f"the report of the run does not show the plan: {error}"
-    return PlannedDrive(made, files, studied.driven_s, gathered.lossy, report, warning)
+    return replace(drive, report=report, warning=warning)
 
 
 def suggest_plan(run: str, options: Options) -> str | None:

@@ -335,7 +335,7 @@ _EVENTS_SHOWN = 5
 
 
 def format_watch(look: Mapping[str, Any]) -> list[str]:
-    """What is known of a recording that is being written, as lines of a screen.
+    """What is known of a recording that is being written, as lines of a screen: what is wrong first.
 
     Args:
         look: an object of `pipeline.live.follow`.
@@ -344,15 +344,16 @@ def format_watch(look: Mapping[str, Any]) -> list[str]:
     errors = [math.nan if one is None else one for one in (look["error"] or {}).values()]
     rows = [
         ("watching", f"{look['log']}    {'closed' if look['closed'] else 'being written'}"),
+        ("not yet", look["problem"]),
+        *(("faults", text) for text in look["faults"]),
         ("so far", format_duration(look["t_s"])),
+        ("vehicle", look["vehicle"]),
         ("slip", slip and f"{slip} (median)"),
         ("error", errors and f"{format_errors(*errors)} over 2 s with the model so far"),
         *_list_known(look["known"]),
         *(("events", f"{one['t_start']:.1f} s: {one['text']}") for one in look["events"][-_EVENTS_SHOWN:]),
         *(("drive", text) for text in look["drive_next"]),
         ("enough", "all effects are known within 5 %: no more driving is needed" * look["enough"]),
-        ("vehicle", look["vehicle"]),
-        ("not yet", look["problem"]),
     ]
     shown = [(label, text) for label, text in rows if text]
     labels = ["", *(label for label, _ in shown)]
@@ -368,7 +369,7 @@ def _list_known(numbers: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
         text = "not determined"
         if one["low"] is not None and one["high"] is not None:
             text = format_interval(one["value"], one["low"], one["high"], one["unit"])
-            text += "" if one["is_known"] else ", not yet known"
+            text = text if one["is_known"] else f"not yet known: {text}"
         label = "known" if one["is_known"] else "open"
         rows.append((label, f"{one['effect']}: {one['parameter']} {text}"))
     return rows

@@ -155,7 +155,7 @@ def _add_offset(facts: Facts, table: ParameterTable, gate: str) -> None:
     condition, lower, turn = _find_condition(facts)
     table.head.append(
         f"steer_offset = {offset.value:.5g} rad with gate {gate}: true less measured angle as in "
-        f"steer_offset_estimator{condition}; another load, tyre or ground may change it."
+        f"steer_offset_estimator{condition}; other load, wheels or ground may change it."
     )
     is_applied = gate != "off"
     sources = (*offset.sources, f"{_MPC}; gate {gate}: the offset is {'' if is_applied else 'not '}applied")

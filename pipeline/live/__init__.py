@@ -30,7 +30,14 @@ from pipeline.results import (
     read_findings,
     read_result,
 )
-from pipeline.words import describe_need, describe_separation, format_finding, is_open, suggest_drive
+from pipeline.words import (
+    describe_need,
+    describe_separation,
+    format_finding,
+    has_dead_encoder,
+    is_open,
+    suggest_drive,
+)
 
 RUNNING_T = 2.0 * LEAST_T
 """Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make bench NAME=watch` counts
@@ -146,7 +153,8 @@ def summarize(answer: dict[str, Any], diagnosis: RunDiagnosis, before: Sequence[
         ``t_s``, recorded time [s]; ``slip``, median slip modulus [m/s] by input; ``error``, of the model so
         far over 2 s of driving that was not fitted; ``known``, from `list_known`; ``drive_next``, sentences;
         ``events``; ``enough``, whether more such driving changes nothing; ``vehicle``, that its lengths are a
-        guess, else empty; ``problem``, why there is no answer yet, else empty.
+        guess, else empty; ``faults``, sentences on dead sensors and wrong signals; ``problem``, why there is
+        no answer yet, else empty.
     """
     findings, ladder, known = read_findings(answer), diagnosis.ladder, list_known(diagnosis, before)
     # All effects are reported, within the share that is the goal, and the model is at the noise floor.
@@ -175,6 +183,11 @@ def summarize(answer: dict[str, Any], diagnosis: RunDiagnosis, before: Sequence[
         ],
         "enough": is_enough,
         "vehicle": next((format_finding(one) for one in findings if one.id == "vehicle_fitted"), ""),
+        "faults": [
+            format_finding(one)
+            for one in findings
+            if one != refusal and (one.severity == "error" or has_dead_encoder([one]))
+        ],
         "problem": answer.get("problem") or (format_finding(refusal) if refusal else ""),
     }
 

@@ -24,6 +24,7 @@ from pipeline.plan.plan_files import (
     CheckedPlan,
     check_plan,
     choose_topic,
+    list_commands,
     read_plan,
     require_played,
     write_plan,

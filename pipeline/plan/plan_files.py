@@ -17,6 +17,8 @@ from pipeline.core import (
     format_digits,
     format_share,
     group_by,
+    mapping_in,
+    objects_in,
     parse_toml,
     pick,
     read_bounded_text,
@@ -55,6 +57,12 @@ def choose_topic(vehicle: Vehicle, manifest: Manifest | None = None) -> tuple[st
     # The topic of a single motor does not accept body commands.
     usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
     return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
+
+
+def list_commands(manifest: Manifest) -> list[str]:
+    """Names of the topics of a stored run that may be its command, the chosen one first."""
+    chosen = mapping_in(mapping_in(read_choices(manifest), "choices"), "command")
+    return [str(one["topic"]) for one in (chosen, *objects_in(chosen, "others")) if "topic" in one]
 
 
 def list_types(*, steered: bool) -> tuple[str, ...]:

@@ -488,7 +488,7 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
         return []
     noted = {one.id for one in run.findings}
     if CHANGE in noted:
-        causes = "load, tyres, battery, controller or terrain"
+        causes = "load, wheels, battery, controller or terrain"
         return [
             f"next steps: find out what changed then ({causes}); cut the log there, and diagnose both parts"
         ]

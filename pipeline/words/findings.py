@@ -1115,10 +1115,10 @@ def _pose_angle(of: Values) -> str:
 
 def _pose_lever(of: Values) -> str:
     size, half = format_length(abs(of["value"])), format_length(of["half_m"])
-    side = "behind" if of["value"] > 0.0 else "ahead of"
+    side = "ahead of" if of["value"] > 0.0 else "behind"
     return (
-        f"the body turns about a point {size} (±{half}) {side} that of the poses of {of['pose']}: they are "
-        "of a sensor that is mounted there, or the wheels do not grip alike front and rear"
+        f"the point whose poses {of['pose']} gives lies {size} (±{half}) {side} the axis about which the "
+        "body turns: it is not corrected, since wheels that grip unlike front and rear move that axis, too"
     )
 
 

@@ -287,9 +287,24 @@ def test_a_wide_interval_and_a_guessed_vehicle_are_told_as_such() -> None:
     shown = format_watch(
         {"log": "run.mcap", "closed": False, **summarize(answer, RunDiagnosis(effects=(wide, narrow)), None)}
     )
-    assert shown[2] == "known     drive_gain: g 0.800 [0.790, 0.810]"
-    assert shown[3] == "open      effective_track: k 1.8 [0.6, 3.0], not yet known"
-    assert [line.startswith("vehicle   no vehicle is given") for line in shown].count(True) == 1
+    assert shown[2].startswith("vehicle   no vehicle is given")
+    assert shown[3] == "known     drive_gain: g 0.800 [0.790, 0.810]"
+    assert shown[4] == "open      effective_track: k not yet known: 1.8 [0.6, 3.0]"
+
+
+def test_what_is_wrong_is_shown_before_any_number() -> None:
+    dead = {"id": "wheel_dead", "severity": "error", "where": "wheels left"}
+    values = {"side": "left", "other": "right", "has_pose": True}
+    answer = {
+        "log": {"duration_s": 30.0},
+        "by_input": {"measured": {"median_modulus": 0.4}},
+        "findings": [{**dead, "values": values}],
+    }
+    look = {"log": "run.mcap", "closed": False, **summarize(answer, RunDiagnosis(), None)}
+    labels = [line.split()[0] for line in format_watch(look)]
+    assert labels[0] == "watching"
+    wrong = next(n for n, line in enumerate(format_watch(look)) if "the left wheels' encoder" in line)
+    assert wrong == 1 < labels.index("slip")
 
 
 def test_it_asks_until_it_knows_enough() -> None:

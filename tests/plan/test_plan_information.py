@@ -14,15 +14,18 @@ from verbs import run_verb
 import slip
 from pipeline.analysis import Options
 from pipeline.api import suggest_plan
+from pipeline.api.drives import PlannedDrive
 from pipeline.cli.screen import format_run
 from pipeline.estimation.stored_diagnosis import read_stored_diagnosis
 from pipeline.models import Largest, Number, find_effect
 from pipeline.plan import (
+    FILES,
     PlanError,
     Studied,
     check_plan,
     choose_limits,
     choose_topic,
+    list_commands,
     make_plan,
     parse_area,
     study,
@@ -176,6 +179,24 @@ def test_a_plan_is_the_next_step_only_where_its_drive_decides(
     assert suggested == flags
     screen = format_run(run.summary, unchanged=False, plan=suggested)
     assert ("slip plan field/wide    the drive" in screen) == (flags is not None)
+
+
+def test_a_plan_says_that_no_log_holds_commands_on_its_topic(stored_run: Path) -> None:
+    manifest = slip.load("field/wide", results=stored_run / "results").manifest
+    recorded = list_commands(manifest)
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    # Where wheel speeds are commanded it is the usual topic of the vehicle.
+    assert recorded == ["/wheel_commands", "/controller/cmd_vel"]
+    assert choose_topic(vehicle, manifest)[0] == "/controller/cmd_vel"
+    limits, area = choose_limits(vehicle, speed_mps=0.8), parse_area("20x10m", vehicle)
+    plan = make_plan(Studied(vehicle), limits, area, 60.0, ("/base/cmd_vel", "geometry_msgs/msg/Twist"))
+    files = tuple(Path(name) for name in FILES)
+    for known, is_said in ((tuple(recorded), True), ((), False)):
+        screen = " ".join(PlannedDrive(plan, files, 60.0, recorded=known).describe())
+        assert (
+            "no commands on /base/cmd_vel, those are on /controller/cmd_vel: --topic" in screen
+        ) == is_said
 
 
 @pytest.mark.long

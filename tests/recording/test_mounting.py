@@ -47,7 +47,7 @@ def test_a_sensor_ahead_of_the_axle(ahead_m: float, tmp_path: Path) -> None:
     mounted = replace(drive, place=drive.place + ahead_m * np.exp(1j * drive.yaw))
     lever, text = find(write_log(tmp_path / "log.mcap", mounted))["pose_lever"]
     assert lever == pytest.approx(ahead_m, abs=0.02)
-    assert ("behind" if ahead_m > 0.0 else "ahead of") in text
+    assert ("ahead of" if ahead_m > 0.0 else "behind") in text
 
 
 def test_at_one_speed_nothing_tells_a_sensor_ahead_from_a_slide(tmp_path: Path) -> None:

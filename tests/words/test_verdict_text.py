@@ -52,6 +52,9 @@ def test_every_effect_reads_well_in_a_verdict() -> None:
         clause = describe_clause(drawn.effects[0], drawn)
         assert _NUMBER.search(clause)
         assert len(clause) < 80
+        # Wheels are of plastic, too, or run in tracks.
+        assert "tyre" not in clause
+        assert not any("tyre" in one.text for one in kind.readings)
         assert re.search(r"\. (The robot [a-z]+s |The [a-z]+ )", verdict)
 
 

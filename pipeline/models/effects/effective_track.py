@@ -42,6 +42,6 @@ EffectiveTrack = declare(
     readings=(
         Meaning(Level.VEHICLE, "geometry", "a wrong track width"),
         Meaning(Level.TERRAIN, "effective_track", "skidding"),
-        Meaning(Level.RUN, "effective_track", "a change of tyre pressure or load"),
+        Meaning(Level.RUN, "effective_track", "a change of load, or of the wheels (pressure, wear)"),
     ),
 )

@@ -1,7 +1,7 @@
 """Effective wheelbase: a car turns less, or more, than its wheelbase and steering angle predict.
 
 The effective length is l_eff = k l. k is a plain number, off one by a few percent where the sheet has the
-wrong length, a rear axle steers along or tyres give way. Steer to both sides at several angles.
+wrong length, a rear axle steers along or wheels give way sideways. Steer to both sides at several angles.
 
 Source: kinematic bicycle; Gillespie, Fundamentals of Vehicle Dynamics, low-speed turning.
 """
@@ -31,7 +31,7 @@ EffectiveWheelbase = declare(
         1.1,
         least=Least(0.01, Least.DATA_SHEET),
         plausible=Plausible(
-            0.5, 2.0, "wider than a wheelbase that is given wrongly, and than tyres give way"
+            0.5, 2.0, "wider than a wheelbase that is given wrongly, and than wheels give way"
         ),
         quantities=(Quantity.WHEELBASE,),
     ),
@@ -40,7 +40,7 @@ EffectiveWheelbase = declare(
     needs=(Excitation.STEERING,),
     readings=(
         Meaning(Level.VEHICLE, "geometry", "a wrong wheelbase"),
-        Meaning(Level.TERRAIN, "effective_wheelbase", "deforming tyres"),
-        Meaning(Level.RUN, "effective_wheelbase", "a change of tyre pressure or load"),
+        Meaning(Level.TERRAIN, "effective_wheelbase", "wheels that give way sideways"),
+        Meaning(Level.RUN, "effective_wheelbase", "a change of load, or of the wheels (pressure, wear)"),
     ),
 )

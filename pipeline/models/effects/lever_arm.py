@@ -1,6 +1,8 @@
-"""Lever arm: the reported pose is that of a point beside base_link.
+"""Lever arm: the reported pose is that of a point beside the axis of rotation.
 
-v_w is the yaw rate of the model. l_x, l_y [m], 0 to 0.3. Check the transform between sensor and base_link.
+v_w is the yaw rate of the model. l_x, l_y [m], 0 to 0.3: poses of a sensor or antenna that no transform moves
+to base_link, a wrong transform, a base_link that is not between the driven wheels, or a load that moves the
+axis. Check the transform first.
 
 Source: rigid body motion of a point; see any text on mechanics.
 """

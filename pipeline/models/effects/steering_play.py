@@ -1,6 +1,6 @@
-"""Steering play: tyres stay where they are until the steering has moved through its play.
+"""Steering play: wheels stay where they are until the steering has moved through its play.
 
-g [rad], half of the play at the tyres: 0.01 is usual, 0.05 a worn linkage. Steer to both sides, in small and
+g [rad], half of the play at the wheels: 0.01 is usual, 0.05 a worn linkage. Steer to both sides, in small and
 large steps, while driving.
 
 Source: the play operator; Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlash.
@@ -36,7 +36,7 @@ SteeringPlay = declare(
         "rad",
         (0.0, 0.3),
         0.0,
-        "half of the play, at the tyres",
+        "half of the play, at the wheels",
         0.05,
         starts=(0.02, 0.06),
         step=1e-3,

@@ -1,6 +1,6 @@
 """Steering rate limit: the steering angle changes no faster than its actuator can.
 
-limit [rad/s], 0.2 to 0.6 at the tyres of a car. Command large and quick changes of steering: slow ones
+limit [rad/s], 0.2 to 0.6 at the wheels of a car. Command large and quick changes of steering: slow ones
 are reached at once and do not show it.
 
 Source: the steering rate limit of vehicle models; Rajamani, Vehicle Dynamics and Control, steering actuators.

@@ -1,8 +1,8 @@
 """Steering sensor offset: the steering angle is not zero where its sensor reads zero.
 
-delta [rad] is the measured steering, o [rad] what the tyres steer beyond it, about 0.02: a sensor that was
-zeroed off centre, a bent linkage, or a "measured" angle that repeats the command. What sensor and tyres share
-is steering_offset; from the command alone the two are one. Drive straight at several speeds.
+delta [rad] is the measured steering, o [rad] what the wheels steer beyond it, about 0.02: a sensor that was
+zeroed off centre, a bent linkage, or a "measured" angle that repeats the command. What sensor and wheels
+share is steering_offset; from the command alone the two are one. Drive straight at several speeds.
 
 Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 """

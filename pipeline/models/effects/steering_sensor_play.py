@@ -1,9 +1,9 @@
-"""Steering sensor play: tyres stay where they are until their sensor has moved through the play.
+"""Steering sensor play: wheels stay where they are until their sensor has moved through the play.
 
     delta = min(max(delta, u_delta - g), u_delta + g)
 
-u_delta [rad] is the measured steering, delta that of the tyres, g [rad] half of the play between them: a
-sensor on the column or the rack does not see the play of joints and tie rods. What sensor and tyres share is
+u_delta [rad] is the measured steering, delta that of the wheels, g [rad] half of the play between them: a
+sensor on the column or the rack does not see the play of joints and tie rods. What sensor and wheels share is
 steering_play; from the command alone the two are one. Steer to both sides, in small and large steps, while
 driving.
 
@@ -22,14 +22,14 @@ from pipeline.run import Rolling, RunContext
 
 
 class SteeringSensorPlay(KinematicEffect):
-    """Steering sensor play: tyres stay where they are until their sensor has moved through the play."""
+    """Steering sensor play: wheels stay where they are until their sensor has moved through the play."""
 
     id = "steering_sensor_play"
     # As the offset of the sensor, before all effects that scale the rolling velocity.
     rank = -1
     kinds = ACKERMANN
     parameters = (
-        replace(SteeringPlay.parameters[0], about="half of the play between steering sensor and tyres"),
+        replace(SteeringPlay.parameters[0], about="half of the play between steering sensor and wheels"),
     )
     needs, confused_with = SteeringPlay.needs, SteeringPlay.confused_with
 

@@ -45,6 +45,6 @@ WheelRadius = declare(
     readings=(
         Meaning(Level.VEHICLE, "wheel_radius", "a wrong wheel radius"),
         Meaning(Level.TERRAIN, "longitudinal_slip", "longitudinal slip"),
-        Meaning(Level.RUN, "wheel_radius", "a change of tyre pressure or load"),
+        Meaning(Level.RUN, "wheel_radius", "a change of load, or of the wheels (pressure, wear)"),
     ),
 )
