@@ -7,6 +7,7 @@ recorder's own clock jumps over hours, all topics are silent at once, and the ti
 """
 
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -39,6 +40,8 @@ _FREQUENT = 4
 _DENSE = 1.6
 """Ratio to the usual number of messages in a bin above which the recorder's clock repeated it: closer to two
 than to one."""
+_SHARE = 0.8
+"""Share of the topics that are dense where the recorder's clock repeated a time."""
 _OTHER_RATE = 5e-3
 """Difference in rate that no two real clocks have; simulated time does."""
 _BENT_S = 0.3
@@ -541,18 +544,21 @@ def drop_repeated_stamps(
     """Leave out messages recorded while the recorder's clock repeated a time span.
 
     When that clock is set back, log times and stamps repeat, and a log sorted by log time mixes both passes.
-    Every topic is then twice as dense for this span. The pass of a message is unknown, so messages of both
-    are left out, and the gap ends the segment.
+    The topics are then twice as dense for this span, but for transforms, where one of equal stamps is left.
+    The pass of a message is unknown, so messages of both are left out, and the gap ends the segment.
     """
     counts = {
         key: _count_messages(clock.stamp[clock.usable]) for key, clock in clocks.items() if clock.usable.any()
     }
-    dense: list[set[int]] = []
+    dense: list[list[int]] = []
     for places, sizes in counts.values():
         usual = float(np.median(sizes))
         if usual >= _FREQUENT:
-            dense.append(set(places[sizes > _DENSE * usual].tolist()))
-    twice = sorted(set.intersection(*dense)) if len(dense) > 1 else []
+            dense.append(places[sizes > _DENSE * usual].tolist())
+    least = max(2.0, _SHARE * len(dense))
+    twice = sorted(
+        place for place, count in Counter(itertools.chain.from_iterable(dense)).items() if count >= least
+    )
     if not twice:
         return dict(clocks), []
     edges = {index + offset for index in twice for offset in (-1, 0, 1)}

@@ -22,13 +22,14 @@ from pipeline.words import format_finding
 ROOT = Path(__file__).parents[2]
 CASES = ROOT / ".." / "shared" / "cases"
 CHANGES = {change.name: change for change in list_changes()}
-# Wheel commands beside body commands, a car by its joints, and a vehicle that nothing names.
-SAMPLES = ("husky_tile", "ackermann_gravel", "turtlebot4")
+# Wheel commands beside body commands, a car by its joints, a vehicle that nothing names, poses in transforms.
+SAMPLES = ("husky_tile", "ackermann_gravel", "turtlebot4", "nav2")
 QUICK = {
     ("husky_tile", "an arm beside the wheels"),
     ("husky_tile", "poses turned by 90 degrees"),
     ("husky_tile", "right wheels reversed"),
     ("husky_tile", "clock back by 10 s"),
+    ("nav2", "clock back by 10 s"),
     ("ackermann_gravel", "both encoders backward"),
     ("husky_tile", "left encoder dies"),
     ("husky_tile", "pivots about the left wheels"),
