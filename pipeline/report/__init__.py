@@ -404,9 +404,9 @@ def mark_batch(store: Store) -> None:
     Raises:
         StoreError: the disk reports an error.
     """
-    told = format_batch(store)
+    text = format_batch(store)
     store.edit_results_text(
-        CATALOGUE, partial(_BATCH.sub, lambda match: f"{match[1]}{told}{match[2]}", count=1)
+        CATALOGUE, partial(_BATCH.sub, lambda match: f"{match[1]}{text}{match[2]}", count=1)
     )
 
 

@@ -87,7 +87,7 @@ else:
                 "see_log",
                 "stored_contexts",
                 "stored_keys",
-                "tell_apart",
+                "name_distinctly",
             ),
             "verification": (
                 "RUNS",
