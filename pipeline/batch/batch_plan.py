@@ -27,7 +27,7 @@ from pipeline.store import (
     StoreError,
     add_digits,
     hash_json,
-    make_distinct,
+    name_distinctly,
     path_unread,
     recorded_path,
     see_log,
@@ -138,19 +138,19 @@ def name_runs(
             is_copy = path != holder.path and (holder.run in claimed or is_present(holder.run))
             (copies if is_copy else runs)[path] = holder.run
             claimed |= set() if is_copy else {holder.run}
-    earlier = {each.path: each.run for each in known if each.run not in claimed}
-    rest = sorted(sizes.keys() - runs.keys() - copies.keys(), key=lambda path: (path not in earlier, path))
+    by_path = {each.path: each.run for each in known if each.run not in claimed}
+    rest = sorted(sizes.keys() - runs.keys() - copies.keys(), key=lambda path: (path not in by_path, path))
     first: dict[str, Path] = {}
     twins = {path: first.setdefault(hashes.get(path) or str(path), path) for path in rest}
     locations |= {run: path for path, run in runs.items()}
-    fresh = [path for path in rest if twins[path] == path and path not in earlier]
-    names = make_distinct({path: name_listed(path) for path in (*locations.values(), *others, *fresh)})
+    fresh = [path for path in rest if twins[path] == path and path not in by_path]
+    names = name_distinctly({path: name_listed(path) for path in (*locations.values(), *others, *fresh)})
     for path in rest:
         if twins[path] != path:
             copies[path] = runs[twins[path]]
             continue
-        run = earlier.get(path) or names[path]
-        if path not in earlier and run in locations:
+        run = by_path.get(path) or names[path]
+        if path not in by_path and run in locations:
             content = hashes.get(path) or find_hash(path)
             run = add_digits(run, content) if content else ""
         locations[run] = path

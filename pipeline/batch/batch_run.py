@@ -174,8 +174,8 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     planned, settled, notes = make_plan(listed, store, request)
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
     skipped = [each for each in listed.skipped if str(each.path) not in ignored]
-    omitted: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
-    note: dict[str, JSON] = {"began": began, "at": None, "left_out": omitted}
+    unseen: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
+    note: dict[str, JSON] = {"began": began, "at": None, "left_out": unseen}
     if request.targets:
         _note_batch(store, note)
     todo = _select(planned, request.shard)

@@ -344,8 +344,15 @@ def render_catalogue(store: Store) -> str:
             for state, count in count_logs(noted).items()
             if count
         ],
-        explained=[{**one, "state": name_state(one["state"])} for one in noted if one["state"] != "done"],
+        explained=[_explain(one) for one in noted if one["state"] != "done"],
     )
+
+
+def _explain(noted: Mapping[str, str]) -> dict[str, str]:
+    """A log that needs a look, in words."""
+    if noted["state"] == "copy":
+        return {**noted, "reason": f"the same content as {noted['reason']}"}
+    return {**noted, "state": name_state(noted["state"])}
 
 
 def list_noted(store: Store) -> list[dict[str, str]]:

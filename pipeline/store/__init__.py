@@ -87,7 +87,7 @@ else:
                 "see_log",
                 "stored_contexts",
                 "stored_keys",
-                "make_distinct",
+                "name_distinctly",
             ),
             "verification": (
                 "RUNS",

@@ -36,7 +36,7 @@ def name_plainly(path: Path, folders: int = 1) -> str:
     return os.fsencode("/".join([*inside, stem_of(path)])).decode("utf-8", "backslashreplace")
 
 
-def make_distinct(logs: Mapping[Path, Path]) -> dict[Path, str]:
+def name_distinctly(logs: Mapping[Path, Path]) -> dict[Path, str]:
     """Names of the runs of logs: folder/stem, and before it as many folders as tell a log from the others.
 
     Logs of one folder and stem keep one name.
@@ -81,7 +81,7 @@ def name_run(path: Path, sha256: str, store: Store) -> str:
     known = [*(run for run in same if run in here), *same, *here]
     if known:
         return known[0]
-    name = make_distinct({log: log for log in (*locations.values(), absolute)})[absolute]
+    name = name_distinctly({log: log for log in (*locations.values(), absolute)})[absolute]
     return add_digits(name, sha256) if name in locations else name
 
 

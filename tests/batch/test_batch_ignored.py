@@ -51,6 +51,7 @@ def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
     page = unescape((folder / "season" / "index.html").read_text())
     (line,) = re.findall(r"Logs of batches: (.*)\.</p>", page)
     assert line == "1 done, 1 with losses, 1 failed, 1 copy, 1 ignored"
+    assert re.search(r'<span class="bad">copy</span>: the same content as field/\w+', page)
     assert all(name in page for name in ("cut.mcap", "text.mcap", "dead.mcap"))
     screen = run_verb(*words[:8], cwd=folder).stdout
     assert re.search(r"^ignored +1$", screen, re.MULTILINE)
