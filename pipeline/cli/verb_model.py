@@ -170,8 +170,8 @@ def fit(  # noqa: D417 - the shared options document themselves
         file = open_model(model, spoken.effects)
     changed = file
     if afresh:
-        neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
-        changed = replace(file, model=file.model.swap(*neutral), numbers={})
+        bare = file.model.swap(*(effect.unfitted for effect in file.model))
+        changed = replace(file, model=bare, numbers={})
     return _change(model, file, changed, spoken, predict=predict or (), first_s=first_s, prior=prior)
 
 

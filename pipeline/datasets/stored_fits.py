@@ -201,6 +201,11 @@ def fit_to_runs(
     old = new = assess_model(data, known, per_run=before.per_run)
     if after.model.effects != known.effects:
         new = assess_model(data, after.model, per_run=after.per_run)
+    if not {*known.ids} <= {*after.model.ids}:
+        # Beside an effect that is gone, values may have come to be where those of the rest alone never lead.
+        bare = after.model.swap(*(effect.unfitted for effect in after.model))
+        again = assess_model(data, bare, per_run=after.per_run)
+        new = min(new, again, key=lambda one: one.fitted.score)
     noted = note_fit(after, new)
     said = {"first_s": first_s, "prior": None if fleet is None else "fleet"}
     fit = {**noted.fit, **{key: value for key, value in said.items() if value is not None}}

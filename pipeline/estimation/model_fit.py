@@ -46,6 +46,11 @@ class Fitted:
         return Model(self.data.vehicle, self.state.effects)
 
     @property
+    def score(self) -> float:
+        """Minus twice the logarithm of its likelihood: smaller is better."""
+        return sum(fit.score for fit in self.fits)
+
+    @property
     def free(self) -> tuple[Free, ...]:
         """All fitted parameters."""
         return tuple(number for fit in self.fits for number in fit.free)

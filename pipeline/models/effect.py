@@ -366,6 +366,11 @@ class Effect(ABC):
         """The same effect with its values as model files have them."""
         return self.change(**{p.name: p.round(self.values[p.name]) for p in self.parameters})
 
+    @property
+    def unfitted(self) -> Self:
+        """The same effect at neutral values, but for parameters that a fit must not change."""
+        return self.change(**{one.name: one.neutral for one in self.parameters if one.name not in self.fixed})
+
     def fix(self, *names: str) -> Self:
         """The same effect with parameters that a fit must not change.
 

@@ -166,8 +166,10 @@ def require_sources(chosen: Choice, index: LogIndex, options: LogOptions) -> Non
         named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
         findings = [one for one in chosen.findings if one.id == "numbers_not_used"]
         unused = [f"not used: {one.values['what']}" for one in findings]
-        # These have lines of their own, or are no drive by their content.
-        unusable = {one.where for one in findings}
+        # Joints that are no drive by their content are none by being named.
+        unusable = {
+            one.where for one in findings if find_type(index.types.get(one.where, "")).joints is not None
+        }
         rest = tuple(one for one in index.channels if one.topic not in unusable)
         is_there = _may_be_named(replace(index, channels=rest), "drive", "number", "numbers", "joints")
         named = ". ".join([*(unused or [_RECORD_DRIVE]), *([named] if is_there else [])])

@@ -244,6 +244,18 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(place: Path)
     assert ": changed as requested" in told
 
 
+def test_what_remains_of_a_model_is_fitted_as_if_the_dropped_had_never_been(place: Path) -> None:
+    """A lag leaves nothing to an overshoot beside it, whose damping then is where no derivative pulls."""
+    on = ("--on", "field/wide")
+    (place / "alone.toml").write_bytes((place / "husky.toml").read_bytes())
+    ask_verb("model", "add", "husky.toml", "effective_track", "drive_lag", *on)
+    ask_verb("model", "add", "husky.toml", "drive_overshoot", *on, "--anyway")
+    dropped = ask_verb("model", "drop", "husky.toml", "drive_lag", *on)
+    alone = ask_verb("model", "add", "alone.toml", "effective_track", "drive_overshoot", *on, "--anyway")
+    for key in ERRORS:
+        assert dropped["ladder"][-1][key] == pytest.approx(alone["ladder"][-1][key], rel=1e-3)
+
+
 def test_what_is_left_out_of_a_log_stands_below_what_it_belongs_to(samples: Path) -> None:
     usual = print_verb("inspect", samples / "mystery_3.mcap").splitlines()
     (pose,) = (index for index, line in enumerate(usual) if line.startswith("pose "))
