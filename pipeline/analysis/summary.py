@@ -150,7 +150,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     setup, generation = work.setup, work.generation
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
-    by_input = summarize_inputs(aggregates)
+    by_input = summarize_inputs(aggregates, generation.read_table("slip"))
     leading = "command" if "command" in by_input else "measured"
     whole = pick_row(aggregates, leading, "all")
     asked = "both" if len(work.options.inputs) > 1 else work.options.inputs[0]

@@ -188,6 +188,14 @@ def _size(content: Mapping[str, object], key: str) -> str:
     return "-" if value is None else f"{value:#.2g}".removesuffix(".")
 
 
+def _size_with_interval(content: Mapping[str, object], key: str) -> str:
+    """A speed [m/s] with its interval where it has one."""
+    value, low, high = (number_in(content, name) for name in (key, f"{key}_low", f"{key}_high"))
+    if value is None or low is None or high is None:
+        return f"{_size(content, key)} m/s"
+    return format_interval(value, low, high, "m/s")
+
+
 def _row(label: str, text: str) -> str:
     return f"{label:<{_LABEL}}{text}"
 
@@ -264,7 +272,7 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
 
 def _format_medians(by_input: Mapping[str, object], key: str) -> str:
     parts = (
-        f"{_size(mapping_in(by_input, name), key)} m/s {words}"
+        f"{_size_with_interval(mapping_in(by_input, name), key)} {words}"
         for name, words in INPUT_WORDS.items()
         if name in by_input
     )

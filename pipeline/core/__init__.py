@@ -128,6 +128,7 @@ else:
                 "list_likelihoods",
                 "nearest_indices",
                 "number_stretches",
+                "resample_median",
                 "recur",
                 "robust_spread",
                 "robust_spreads",

@@ -9,6 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pipeline.core.text import FEWEST_OF_SPREAD
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -31,6 +33,27 @@ def group_rows(number: NDArray[Any]) -> list[Ints]:
     """Row indices grouped by number, groups and rows in ascending order."""
     order = np.argsort(number, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
+
+
+_RESAMPLES = 200
+"""Bootstrap resamples: they give the standard deviation to a twentieth."""
+
+
+def resample_median(values: Floats, times: Floats) -> Floats:
+    """Medians of bootstrap samples, drawn by stretches of ten seconds: samples next to each other are alike.
+
+    Args:
+        values: shape (n,).
+        times: their times [s], increasing, shape (n,).
+
+    Returns:
+        The medians, shape (k,); none where there are fewer stretches than for a spread.
+    """
+    stretches = group_rows(number_stretches(times - times[:1]))
+    if len(stretches) < FEWEST_OF_SPREAD:
+        return np.empty(0)
+    drawn = np.random.default_rng(0).integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
+    return np.array([np.median(values[np.concatenate([stretches[i] for i in one])]) for one in drawn])
 
 
 def recur(values: Floats, factors: Floats) -> Floats:

@@ -12,9 +12,9 @@ from pipeline.core import (
     NORMAL_95,
     Floats,
     Ints,
-    group_rows,
     jackknife_deviation,
     number_stretches,
+    resample_median,
     student_quantile,
 )
 from pipeline.estimation.commanded import measure_commanded_turn
@@ -42,8 +42,6 @@ _LEAST_SQUARE = 1e-12
 """Lower bound of a mean square error [m^2, rad^2], to keep its logarithm finite."""
 _LEAST_SLIP = 1e-6
 """Lower bound of a slip modulus [m/s], to keep its logarithm finite."""
-_RESAMPLES = 200
-"""Bootstrap resamples: they give the standard deviation to a twentieth."""
 Estimate = tuple[float, float]
 """A value and its standard deviation."""
 
@@ -180,11 +178,5 @@ def measure_slip(table: pl.DataFrame, source: Input) -> Estimate:
     modulus = np.maximum(rows["modulus"].to_numpy(), _LEAST_SLIP)
     if modulus.size == 0:
         return math.nan, math.nan
-    stretches = group_rows(number_stretches(rows["t"].to_numpy() - float(rows["t"][0])))
-    rng = np.random.default_rng(0)
-    drawn = [
-        np.median(modulus[np.concatenate([stretches[index] for index in picked])])
-        for picked in rng.integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
-    ]
-    known = len(stretches) >= FEWEST_OF_SPREAD
-    return math.log(float(np.median(modulus))), float(np.std(np.log(drawn))) if known else math.nan
+    drawn = np.log(resample_median(modulus, rows["t"].to_numpy()))
+    return math.log(float(np.median(modulus))), float(np.std(drawn)) if drawn.size else math.nan

@@ -313,7 +313,7 @@ def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: RunDiagnosis) -
             return
         generation.reuse_all(SUMMARY)
         show_model(generation, diagnosis, load_vehicle(current), read_length_scale(current))
-        by_input = summarize_inputs(generation.read_table("aggregates"))
+        by_input = summarize_inputs(generation.read_table("aggregates"), generation.read_table("slip"))
         summary = {**current.read_json(SUMMARY), "by_input": by_input}
         generation.write_text(SUMMARY, json.dumps(summary, indent=1) + "\n")
         generation.commit(current.details)

@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import Flags, Floats
+from pipeline.core import CONFIDENCE, Flags, Floats, resample_median
 from pipeline.recording import Finding, StageError
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
@@ -351,19 +351,28 @@ def _height_rate(velocities: pl.DataFrame) -> float | None:
 SUMMARY_DIGITS = 6
 
 
-def summarize_inputs(aggregates: pl.DataFrame) -> dict[str, dict[str, JSON]]:
-    """Samples and medians of every input, for the summary of a run; see table `aggregates`."""
+def summarize_inputs(aggregates: pl.DataFrame, slip: pl.DataFrame) -> dict[str, dict[str, JSON]]:
+    """Samples and medians of every input, for the summary of a run; see the tables of these names.
+
+    The 95 % interval of the median is that of other stretches of ten seconds of the same driving.
+    """
     names = aggregates["input"].unique(maintain_order=True)
-    return {name: _summarize_input(aggregates, name) for name in names}
+    return {name: _summarize_input(aggregates, slip, name) for name in names}
 
 
-def _summarize_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
+def _summarize_input(aggregates: pl.DataFrame, slip: pl.DataFrame, name: str) -> dict[str, JSON]:
     rows = {subset: pick_row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
     whole = rows["all"]
+    known = slip.filter(pl.col("input").cast(pl.String) == name, ~pl.col("suspect"))
+    drawn = resample_median(known["modulus"].to_numpy(), known["t"].to_numpy())
+    ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
+    low, high = np.quantile(drawn, ends).tolist() if drawn.size else (None, None)
     return {
         "samples": int(whole["samples"] or 0),
         "windows": int(whole["windows"] or 0),
         "median_modulus": round_number(whole["median_modulus"]),
+        "median_modulus_low": round_number(low),
+        "median_modulus_high": round_number(high),
         "median_window_norm": round_number(whole["median_window_norm"]),
         "median_residual_modulus": round_number(whole["median_residual_modulus"]),
         "rms": [round_number(whole[f"rms_{axis}"]) for axis in "xyw"],

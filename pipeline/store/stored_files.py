@@ -123,6 +123,8 @@ class _Slip(msgspec.Struct):
     """Slip on one input."""
 
     median_modulus: Number = None
+    median_modulus_low: Number = None
+    median_modulus_high: Number = None
     median_window_norm: Number = None
     median_residual_modulus: Number = None
     transitory_median_modulus: Number = None

@@ -36,6 +36,10 @@ _HEAD = (
     Column("p"),
     Column("spread of runs", wide=True),
 )
+_VALUES = (
+    "values: of the effects of one model, fitted to each run; the diagnosis of a run chooses its own "
+    "effects, with which a number may differ"
+)
 _ABOUT = "p: over all numbers of this check, against how much runs differ beyond their own errors"
 _ALONE = "intervals: of these recordings alone"
 _SPREAD_UNKNOWN = "how much runs of this robot differ without a change is not known"
@@ -174,7 +178,7 @@ def tabulate_check(check: RunsCheck) -> Table:
         before = before.removesuffix(f" {after.partition(' ')[2]}")
         status = Cell(one.status, strong=one.status == "changed")
         rows.append([one.title, status, f"{before} -> {after}", difference, _format_p(one), spread])
-    note = _ABOUT if check.is_spread_known else _ALONE
+    note = f"{_VALUES}; {_ABOUT if check.is_spread_known else _ALONE}"
     return Table("Numbers before and after", _HEAD, rows, note).drop_empty()
 
 
