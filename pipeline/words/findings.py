@@ -992,8 +992,8 @@ def _configured_wrongly(of: Values) -> str:
 def _contradicted(of: Values) -> str:
     one, other = of["halves"]
     return (
-        f"{_fill(FAULTS[of['fault']], of)} by all of the drive, but its halves contradict each other: in the "
-        f"one half the motion is {one:.3g} times the signal, in the other {other:.3g} times. Not corrected "
+        f"{_fill(FAULTS[of['fault']], of)} by all of the drive, but its parts contradict each other: in the "
+        f"first the motion is {one:.3g} times the signal, in the last {other:.3g} times. Not corrected "
         f"({of['line']} under [{of['where']}] in run.toml takes it so)"
     )
 
