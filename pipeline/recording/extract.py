@@ -528,6 +528,14 @@ class Extraction:
             turnings += [] if number is None else read_headings(number, signal.field)
         return turnings
 
+    def own_speed(self) -> tuple[Floats, Floats]:
+        """Times [s] and speeds [m/s] that are recorded with the positions of the pose; empty without any."""
+        source = self.sources.pose
+        receiver = None if source is None else self._timed(source.velocity or source.topic)
+        if source is None or receiver is None:
+            return np.zeros(0), np.zeros(0)
+        return topic_values.read_own_speed(receiver, source)
+
     def _timed(self, topic: str) -> topic_values.Receiver | None:
         ordered = self._ordered(topic)
         if ordered is None:

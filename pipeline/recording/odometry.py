@@ -1,4 +1,4 @@
-"""A message of odometry compared with itself: its pose moves as far as its own speeds say.
+"""A pose compared with its own velocity: it moves as far as the speeds that are recorded with it say.
 
 It is asked before units, clocks and roles: what a message contradicts by itself is of no other topic.
 """
@@ -22,6 +22,8 @@ _APART = 4.0
 as they say at least."""
 _ALIKE = 0.1
 """Largest absolute logarithm of two ratios that are the same: of a unit, or of the time step."""
+_LENGTHS = (*SPEEDS.values(), *(1.0 / one for one in LENGTH_UNITS.values()))
+"""Ratios that a unit of speeds or of positions makes."""
 
 
 def ask_odometry(case: Case) -> Case:
@@ -39,7 +41,7 @@ def ask_odometry(case: Case) -> Case:
         pose = by_topic.get(source.signals[0].topic)
         if source.form is DriveForm.BODY and pose is not None and case.refused is None:
             case = _compare(case, source, pose)
-    return case
+    return case if case.refused is not None else _compare_speed(case)
 
 
 def _compare(case: Case, source: DriveSource, pose: PoseSource) -> Case:
@@ -60,33 +62,68 @@ def _compare(case: Case, source: DriveSource, pose: PoseSource) -> Case:
     if times.size < FEWEST_STEPS:
         return case
     ratios = [_find_ratio(*each) for each in ((times, moved, twist.first), (times, turned, twist.second))]
-    units = ([*SPEEDS.values(), *(1.0 / one for one in LENGTH_UNITS.values())], [*RATES.values()])
     wrong = [
-        ratio is not None
-        and abs(np.log(ratio)) > np.log(_APART)
-        and not any(_is_near(ratio, one) for one in of)
-        for ratio, of in zip(ratios, units, strict=True)
+        ratio is not None and _is_wrong(ratio, of)
+        for ratio, of in zip(ratios, (_LENGTHS, [*RATES.values()]), strict=True)
     ]
     if not (any(wrong) or is_used) and source == case.sources.wheels:
         _correct_units(case, source, ratios)
     if not any(wrong):
         return case
     axis = 1 if wrong[1] else 0
-    is_pose = _is_pose_wrong(case, axis, ratios[axis] or 1.0, (twist.first, twist.second)[axis])
-    step_s = float(np.median(np.diff(times)))
-    is_step = _is_near(ratios[axis] or 1.0, 1.0 / step_s)
-    values = {
-        "kind": "pose" if is_pose else "speeds",
-        "value": ratios[axis],
-        "what": ("moves", "turns")[axis],
-        "source": pose.topic,
-        "step_s": step_s if is_step else None,
-    }
-    finding = Finding("odometry_contradicts_itself", "warning", "pose", values)
-    if is_pose:
+    said = (twist.first, twist.second)[axis]
+    finding = _report(case, pose.topic, times, (axis, ratios[axis] or 1.0), said)
+    if finding.values["kind"] == "pose":
         return replace(case, refused=finding) if is_used else case
     case.findings.append(finding)
     return case.leave_out(source)
+
+
+def _compare_speed(case: Case) -> Case:
+    """The case without what contradicts: positions in use, or the velocities recorded with them."""
+    pose = case.sources.pose
+    if pose is None or pose.wheels is not None or pose.from_transforms:
+        return case
+    try:
+        said = Held(*case.extraction.own_speed())
+        times, moved, _ = _list_changes(case.extraction.poses())
+    except SlipError:
+        return case
+    ratio = _find_ratio(times, moved, said) if times.size >= FEWEST_STEPS else None
+    if ratio is None or not _is_wrong(ratio, _LENGTHS):
+        return case
+    finding = _report(case, pose.topic, times, (0, ratio), said, pose.velocity)
+    if finding.values["kind"] == "pose":
+        return replace(case, refused=finding)
+    case.findings.append(finding)
+    return case
+
+
+def _report(
+    case: Case, topic: str, times: Floats, apart: tuple[int, float], said: Held, velocity: str = ""
+) -> Finding:
+    """What of a pose and the speeds that belong to it is wrong.
+
+    Args:
+        case: the log.
+        topic: of the pose.
+        times: of its messages [s].
+        apart: 0 of its motion, 1 of its turning; and how far it does so over what the speeds say.
+        said: the speeds.
+        velocity: topic of the speeds, where it is another one.
+    """
+    axis, ratio = apart
+    step_s = float(np.median(np.diff(times)))
+    values = {
+        "kind": "pose" if _is_pose_wrong(case, axis, ratio, said) else "speeds",
+        "value": ratio,
+        "what": ("moves", "turns")[axis],
+        "source": topic,
+        "step_s": step_s if _is_near(ratio, 1.0 / step_s) else None,
+    }
+    if velocity:
+        values["velocity"] = velocity
+    return Finding("odometry_contradicts_itself", "warning", "pose", values)
 
 
 def _correct_units(case: Case, source: DriveSource, ratios: Sequence[float | None]) -> None:
@@ -117,6 +154,12 @@ def _find_ratio(times: Floats, changed: Floats, speed: Held) -> float | None:
     rate = changed / np.diff(times, prepend=times[0] - float(np.median(np.diff(times))))
     ratio = find_one_ratio(rate, np.abs(np.interp(times, speed.times, speed.values)), FEWEST_STEPS)
     return ratio or None
+
+
+def _is_wrong(ratio: float, units: Sequence[float]) -> bool:
+    """Whether no skidding and no unit makes a ratio of a pose and its speeds."""
+    is_apart = abs(np.log(ratio)) > np.log(_APART)
+    return bool(is_apart and not any(_is_near(ratio, one) for one in units))
 
 
 def _is_near(ratio: float, other: float) -> bool:

@@ -41,6 +41,12 @@ SIDES = ("left", "right")
 DELAYS_S = np.arange(-0.3, 0.81, 0.05)
 _LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
 _MOST_ROWS = 2000
+_PARTS = 10
+"""Parts of a drive, of equal path, among which a gain is looked for that changes during it."""
+_FEWEST_PARTS = 3
+"""Least number of them on either side of a change: one may be that in which it lies."""
+_VARIES = 0.5 * math.log(2.0)
+"""Logarithm up to which gains of one side differ; those of both sides are apart by a factor of two."""
 """Number of steps on which delays are compared first."""
 
 
@@ -272,6 +278,24 @@ _AS_IT_IS = 0.5
 """Least share of both channels that signals explain as they are: near zero where a side is reversed."""
 
 
+def _find_change(gains: Sequence[float]) -> tuple[float, ...]:
+    """Gains before and after the time at which they change most; none where they vary otherwise as well.
+
+    One part on either side may have any gain: that in which they change.
+    """
+    best, most = tuple[float, ...](), 2.0 * _VARIES
+    for cut in range(_FEWEST_PARTS, len(gains) - _FEWEST_PARTS + 1):
+        sides = [np.array(side) for side in (gains[:cut], gains[cut:])]
+        middles = [float(np.median(np.log(np.abs(side)))) for side in sides]
+        odd = [
+            int((np.abs(np.log(np.abs(side)) - middle) > _VARIES).sum())
+            for side, middle in zip(sides, middles, strict=True)
+        ]
+        if max(odd) <= 1 and abs(middles[1] - middles[0]) > most:
+            best, most = tuple(float(np.median(side)) for side in sides), abs(middles[1] - middles[0])
+    return best
+
+
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Two inputs that may explain a motion; one without inputs is that of signals that do not exist.
@@ -326,7 +350,9 @@ class Reading:
         return (two, one) if crossed and self.form == "body" else (one, two)
 
     def fit_halves(self, channel: str) -> tuple[float, ...]:
-        """Gains of ``ahead`` or ``turned`` in two halves, each with half of its path.
+        """Gains of ``ahead`` or ``turned`` before and after they change, or in two halves of the path.
+
+        They change where parts of equal path have one gain up to some time, and another one from then on.
 
         Returns:
             Two gains; none where one of them is not clear.
@@ -338,12 +364,17 @@ class Reading:
         columns = self.columns(motion.steps, made.lag, made.delay, crossed=made.crossed)
         column, values = (columns[0], motion.body.real) if is_ahead else (columns[1], motion.yaw)
         path = np.cumsum(np.abs(values))
-        first = path < 0.5 * path[-1]
-        if min(first.sum(), (~first).sum()) < FEWEST_STEPS:
-            return ()
-        fits = [fit(values[half], column[half, None], motion.steps.take(half)) for half in (first, ~first)]
-        is_clear = all(abs(float(one.t[0])) > CLEAR for one in fits)
-        return tuple(float(one.gains[0]) for one in fits) if is_clear else ()
+
+        def fit_parts(count: int) -> tuple[float, ...]:
+            number = np.minimum(count * path / path[-1], count - 1).astype(np.int64)
+            parts = [number == part for part in range(count)]
+            if min(part.sum() for part in parts) < FEWEST_STEPS:
+                return ()
+            fits = [fit(values[part], column[part, None], motion.steps.take(part)) for part in parts]
+            is_clear = all(abs(float(one.t[0])) > CLEAR for one in fits)
+            return tuple(float(one.gains[0]) for one in fits) if is_clear else ()
+
+        return _find_change(fit_parts(_PARTS)) or fit_parts(2)
 
     def columns_aside(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> Floats:
         """Increments to the left, in the reading's own units; none, or one, of shape (n, 1)."""

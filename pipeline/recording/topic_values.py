@@ -208,7 +208,7 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     pose = source.fields or kind.pose
     if source.content is PoseContent.POSE and pose is not None:
         axes = (*axis_fields(pose.position, "xyz"), *_turn_fields(pose))
-        named = (*axes, pose.parent, pose.child, pose.names)
+        named = (*axes, *pose.velocity, pose.parent, pose.child, pose.names)
         return [*(Signal(source.topic, name) for name in named if name), *source.headings]
     frame = _frame_field(types[source.topic])
     fields = [*([Signal(source.topic, frame)] if frame else []), *source.headings]
@@ -239,7 +239,7 @@ def _list_optional(source: DriveSource | PoseSource, types: dict[str, str]) -> l
     kind = find_type(types[source.topic])
     pose = source.fields or kind.pose
     if source.content is PoseContent.POSE and pose is not None:
-        names = (*axis_fields(pose.position, "xyz")[2:], pose.parent, pose.child)
+        names = (*axis_fields(pose.position, "xyz")[2:], *pose.velocity, pose.parent, pose.child)
         return [Signal(source.topic, name) for name in names if name]
     fixed = () if kind.fix is None else (kind.fix.latitude, kind.fix.longitude)
     return [one for one in pose_fields(source, types) if one.field not in fixed]
@@ -567,6 +567,24 @@ def read_ground_velocity(columns: TopicColumns) -> Floats:
     velocity = find_type(columns.type_name).ground_velocity
     names = () if velocity is None else (velocity.east, velocity.north)
     return np.stack([numbers(columns, name) for name in names], axis=-1)
+
+
+def read_own_speed(receiver: Receiver, source: PoseSource) -> tuple[Floats, Floats]:
+    """Times [s], and how fast positions move by what is recorded with them [m/s], shape (n,) each.
+
+    Args:
+        receiver: the topic of the velocities: that of the positions, or of a satellite receiver beside them.
+        source: the positions.
+    """
+    columns, rows = receiver.columns, receiver.order
+    kind = find_type(columns.type_name)
+    pose = source.fields or kind.pose
+    names = [] if pose is None or source.content is not PoseContent.POSE else pose.velocity
+    if kind.ground_velocity is not None and source.velocity:
+        names = [kind.ground_velocity.east, kind.ground_velocity.north]
+    names = [name for name in names if name in columns.fields]
+    parts = [numbers(columns, name)[rows] for name in names]
+    return receiver.times[rows], np.hypot(*parts) if len(parts) == 2 else np.full(rows.size, np.nan)  # noqa: PLR2004
 
 
 def read_attitude(columns: TopicColumns) -> Floats | None:

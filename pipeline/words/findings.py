@@ -934,10 +934,13 @@ def _unit_of_wheels(of: Values) -> str:
 
 def _contradicts_itself(of: Values) -> str:
     is_pose, step = of["kind"] == "pose", of["step_s"]
-    text = f"the pose of {of['source']} {of['what']} {of['value']:.3g} times as far as its own speeds say"
+    speeds = f"the speeds of {of['velocity']}" if "velocity" in of else "its own speeds"
+    text = f"the pose of {of['source']} {of['what']} {of['value']:.3g} times as far as {speeds} say"
     if step is not None:
         made = "added up without" if is_pose else "changes that are not divided by"
         text += f", as if these were {made} the time step of {step:.3g} s"
+    if not is_pose and "velocity" in of:
+        return f"{text}; of these only the direction is used"
     return f"{text}; not used: its {of['kind']}"
 
 
@@ -992,8 +995,8 @@ def _configured_wrongly(of: Values) -> str:
 def _contradicted(of: Values) -> str:
     one, other = of["halves"]
     return (
-        f"{_fill(FAULTS[of['fault']], of)} by all of the drive, but its halves contradict each other: in the "
-        f"one half the motion is {one:.3g} times the signal, in the other {other:.3g} times. Not corrected "
+        f"{_fill(FAULTS[of['fault']], of)} by all of the drive, but its parts contradict each other: in the "
+        f"first the motion is {one:.3g} times the signal, in the last {other:.3g} times. Not corrected "
         f"({of['line']} under [{of['where']}] in run.toml takes it so)"
     )
 

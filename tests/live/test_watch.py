@@ -27,7 +27,7 @@ from pipeline.results import Errors, GrownEvidence, Growth, Named, RunDiagnosis,
 from pipeline.simulate import Scenario, simulate_run, write_log
 
 CHUNK = 1 << 14
-PROMISED = {"t_s", "slip", "error", "known", "drive_next", "events", "enough"}
+PROMISED = {"t_s", "slip", "error", "known", "drive_next", "events", "enough", "faults"}
 
 
 def make_log(path: Path, duration_s: float, **settings: object) -> Path:

@@ -194,9 +194,7 @@ def test_a_plan_says_that_no_log_holds_commands_on_its_topic(stored_run: Path) -
     files = tuple(Path(name) for name in FILES)
     for known, is_said in ((tuple(recorded), True), ((), False)):
         screen = " ".join(PlannedDrive(plan, files, 60.0, recorded=known).describe())
-        assert (
-            "no commands on /base/cmd_vel, those are on /controller/cmd_vel: --topic" in screen
-        ) == is_said
+        assert ("on /base/cmd_vel, those are on /wheel_commands and /controller" in screen) == is_said
 
 
 @pytest.mark.long

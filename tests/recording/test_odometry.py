@@ -131,3 +131,67 @@ def test_speeds_that_are_differences_of_positions_are_those_of_the_way_that_is_g
     for one in (evidence["/cmd_vel"], evidence["/odom"]):
         assert one.ahead == pytest.approx(1.0, abs=0.02)
         assert one.turned == pytest.approx(1.0, abs=0.02)
+
+
+LOCAL = "px4_msgs/msg/VehicleLocalPosition"
+LAYOUT = (
+    "uint64 timestamp\nuint64 timestamp_sample\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "float32 vx\nfloat32 vy\nfloat32 heading\n"
+)
+
+
+def record_local(drive: DrawnDrive, *, pose: float = 1.0, speeds: float = 1.0) -> DrawnTopic:
+    """North, east and their velocities, as of PX4."""
+    course = drive.speed * np.exp(1j * drive.yaw)
+    stamp = np.round(drive.time * 1e6).astype(np.int64) + 35_000_000
+    fields = {
+        "timestamp": stamp,
+        "timestamp_sample": stamp,
+        "x": pose * drive.y,
+        "y": pose * drive.x,
+        "z": np.zeros(stamp.size),
+        "vx": speeds * course.imag,
+        "vy": speeds * course.real,
+        "heading": np.pi / 2.0 - drive.yaw,
+    }
+    return record_cdr(drive, "/fmu/out/vehicle_local_position", LOCAL, fields, LAYOUT)
+
+
+def record_fix(drive: DrawnDrive, *, pose: float = 1.0, speeds: float = 1.0) -> tuple[DrawnTopic, ...]:
+    """Fixes and velocities of one receiver, five a second."""
+    rows = drive.rows()[::4]
+    stamps = stamp_ros(drive) | {"header.frame_id": "gps"}
+    degree = 2.0 * np.pi * 6.371e6 / 360.0
+    place = {"latitude": pose * drive.y / degree, "longitude": pose * drive.x / degree}
+    course = speeds * drive.speed * np.exp(1j * drive.yaw)
+    velocity = {"twist.linear.x": course.real, "twist.linear.y": course.imag}
+    return (
+        record_cdr(drive, "/gps/fix", "sensor_msgs/msg/NavSatFix", stamps | place, rows=rows),
+        record_cdr(
+            drive, "/gps/fix_velocity", "geometry_msgs/msg/TwistStamped", stamps | velocity, rows=rows
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("pose", "speeds", "wrong"), [(1.0, 1.0, ""), (20.0, 1.0, "pose"), (1.0, 0.05, "speeds")]
+)
+@pytest.mark.parametrize("kind", ["local", "fix"])
+def test_positions_are_compared_with_the_velocities_that_are_sent_with_them(
+    kind: str, pose: float, speeds: float, wrong: str, tmp_path: Path
+) -> None:
+    drive = draw_drive(120.0)
+    topics = (
+        record_fix(drive, pose=pose, speeds=speeds)
+        if kind == "fix"
+        else (record_local(drive, pose=pose, speeds=speeds),)
+    )
+    setup = set_up(tmp_path, record_twist(drive), *topics)
+    found = [one for one in setup.choice.findings if one.id == "odometry_contradicts_itself"]
+    if kind == "fix" and wrong == "pose":
+        # The velocities are a pose themselves, which follows the commands better.
+        assert str(setup.sources.pose) == "/gps/fix_velocity"
+        return
+    assert [one.values["kind"] for one in found] == [wrong] * bool(wrong)
+    for one in found:
+        assert one.value == pytest.approx(20.0, rel=0.1)

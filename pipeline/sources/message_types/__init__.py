@@ -94,6 +94,7 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         angle_unit: unit of the heading.
         parent: field with the name of the reference frame.
         child: field with the name of the frame whose pose is given.
+        velocity: fields of how fast the position moves [m/s], along axes of any frame.
         names: field with the names of several bodies; position and orientation are sequences of equal length.
         fixed: name of the frame if no field contains it.
         convention: axes of the frames.
@@ -105,6 +106,7 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     angle_unit: Literal["rad", "deg"] = "rad"
     parent: str = ""
     child: str = ""
+    velocity: list[str] = []
     names: str = ""
     fixed: str = ""
     convention: Convention = "flu"
@@ -226,12 +228,12 @@ _PATHS = {
     "drive": ("first", "second", "sideways"),
     "number": ("field", "per_turn"),
     "joints": ("names", "velocity", "position"),
-    "pose": ("position", "orientation", "angle", "parent", "child"),
+    "pose": ("position", "orientation", "angle", "velocity", "parent", "child"),
     "imu": ("rate", "force", "orientation"),
     "fix": ("latitude", "longitude", "altitude", "status", "frame"),
 }
 """Fields of a part that are paths; its other values state what these mean."""
-_OPTIONAL = re.compile(r"pose .*(?:parent|child)$")
+_OPTIONAL = re.compile(r"pose .*(?:velocity|parent|child)$")
 
 
 def _spell_fields(kind: MessageType) -> dict[str, str]:
