@@ -557,7 +557,7 @@ def drop_repeated_stamps(
             dense.append(places[sizes > _DENSE * usual].tolist())
     least = max(2.0, _SHARE * len(dense))
     twice = sorted(
-        place for place, count in Counter(itertools.chain.from_iterable(dense)).items() if count >= least
+        index for index, count in Counter(itertools.chain.from_iterable(dense)).items() if count >= least
     )
     if not twice:
         return dict(clocks), []
