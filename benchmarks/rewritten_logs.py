@@ -506,31 +506,29 @@ def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
         times = np.array([time for time, _ in own])
         x, y = (np.array([pose["position"][axis] for _, pose in own]) for axis in "xy")
         yaw = np.unwrap([_yaw(pose) for _, pose in own])
-        middle = 0.5 * (yaw[1:] + yaw[:-1])
-        ahead, turned = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle), np.diff(yaw)
+        turned = np.diff(yaw)
         left, right = (np.diff(np.interp(times, *wheels[side])) for side in ("left", "right"))
+        # In the direction of the wheels' drive, wherever the headings point.
+        moved = (np.diff(x) + 1j * np.diff(y)) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
+        way = complex(moved @ (left + right))
+        if not way:
+            return None  # It stands.
+        way /= abs(way)
+        moved /= way
+        if moved.imag.std() > _ASIDE * moved.real.std():
+            return None  # Wheels that roll to the side turn the body about no side.
         metres, turn = (
-            float(moved @ drive / (drive @ drive))
-            for moved, drive in ((ahead, 0.5 * (left + right)), (turned, right - left))
+            float(rate @ drive / (drive @ drive))
+            for rate, drive in ((moved.real, 0.5 * (left + right)), (turned, right - left))
         )
         first, last = log.length
         start = first + begins * (last - first)
         past = times[1:] > start
-        aside = np.diff(y) * np.cos(middle) - np.diff(x) * np.sin(middle)
-        if aside.std() > _ASIDE * ahead.std():
-            return None  # Wheels that roll to the side turn the body about no side.
-        ahead, turned = np.where(past, 0.5 * metres * right, ahead), np.where(past, turn * right, turned)
-        aside = np.where(past, 0.0, aside)
+        moved, turned = np.where(past, 0.5 * metres * right, moved), np.where(past, turn * right, turned)
         headings = yaw[0] + np.cumsum(turned)
-        middle = headings - 0.5 * turned
-        motions = zip(
-            np.cumsum(ahead * np.cos(middle) - aside * np.sin(middle)) + x[0],
-            np.cumsum(ahead * np.sin(middle) + aside * np.cos(middle)) + y[0],
-            headings,
-            ahead * 1e9 / np.maximum(np.diff(times), 1),
-            turned * 1e9 / np.maximum(np.diff(times), 1),
-            strict=True,
-        )
+        places = x[0] + 1j * y[0] + np.cumsum(moved * way * np.exp(1j * (headings - 0.5 * turned)))
+        speeds, rates = (one * 1e9 / np.maximum(np.diff(times), 1) for one in (moved * way, turned))
+        motions = zip(places, headings, speeds, rates, strict=True)
         poses = dict(zip(times[1:].tolist(), motions, strict=True))
         stands = _die("left", None, begins)(log, roles)
         span = abs(metres / turn)
@@ -576,15 +574,15 @@ def _read_sides(log: Log, roles: Roles) -> dict[str, tuple[Any, Any]] | None:
     }
 
 
-def _move(one: Message, motion: tuple[float, ...]) -> Message:
+def _move(one: Message, motion: tuple[complex, float, complex, float]) -> Message:
     """A message of poses, and of speeds where it has them, with another motion."""
     content = _copy(one.content)
-    pose, (x, y, yaw, ahead, turning) = _find_pose(content), motion
-    pose["position"] |= {"x": x, "y": y}
+    pose, (place, yaw, speed, turning) = _find_pose(content), motion
+    pose["position"] |= {"x": place.real, "y": place.imag}
     pose["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)}
     if "twist" in content:
         twist = content["twist"]["twist"]
-        twist["linear"] |= {"x": ahead, "y": 0.0}
+        twist["linear"] |= {"x": speed.real, "y": speed.imag}
         twist["angular"] |= {"z": turning}
     return replace(one, content=content)
 

@@ -224,15 +224,16 @@ def _turns_about(side: str, moved: Floats, track_m: float | None) -> bool:
     Args:
         side: ``left`` or ``right``.
         moved: rates ahead and of the heading in blocks, shape (m, 2).
-        track_m: distance of the sides; the middle is half of it from these wheels, to a factor of two, since
-            wheels slip to the side in turns. None for any that vehicles have.
+        track_m: distance of the sides. The middle is half of it from these wheels, or up to three times that
+            where wheels slip to the side in turns. None for any that vehicles have.
     """
-    ahead, turned = moved.T
-    if ahead.size < _SMALLEST_PART or not turned.any():
+    usual = np.quantile(np.abs(moved), 0.95, axis=0, method="nearest") if moved.size else np.zeros(2)
+    ahead, turned = moved[(np.abs(moved) > LIVE_SHARE * usual).any(axis=1)].T
+    if ahead.size < _SMALLEST_PART or not usual.all():
         return False
     made = fit_robustly(turned[:, None], ahead)
     lever = float(made.gains[0]) * (1.0 if side == "left" else -1.0)
-    low, high = _LEVERS_M if track_m is None else (0.25 * track_m, track_m)
+    low, high = _LEVERS_M if track_m is None else (0.25 * track_m, 1.5 * track_m)
     return low < lever < high and find_scale(made.rest) < _ASIDE * find_scale(ahead)
 
 
