@@ -488,6 +488,8 @@ def _die(side: str, reads: float | None, begins: float = 0.6) -> Callable[[Log, 
 
 _ASIDE = 0.5
 """Motion to the side over that ahead of vehicles that drive to the side."""
+_NOISE_M, _NOISE_RAD = 2e-3, 1e-3
+"""Noise of poses that are made."""
 
 
 def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
@@ -527,6 +529,9 @@ def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
         moved, turned = np.where(past, 0.5 * metres * right, moved), np.where(past, turn * right, turned)
         headings = yaw[0] + np.cumsum(turned)
         places = x[0] + 1j * y[0] + np.cumsum(moved * way * np.exp(1j * (headings - 0.5 * turned)))
+        noise = np.random.default_rng(5).normal(0.0, 1.0, (3, past.size)) * past
+        places += _NOISE_M * (noise[0] + 1j * noise[1])
+        headings += _NOISE_RAD * noise[2]
         speeds, rates = (one * 1e9 / np.maximum(np.diff(times), 1) for one in (moved * way, turned))
         motions = zip(places, headings, speeds, rates, strict=True)
         poses = dict(zip(times[1:].tolist(), motions, strict=True))

@@ -71,7 +71,8 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     likeliest = max(scores, key=lambda key: float(scores[key].sum()))
     margin = compare(scores[likeliest], scores[usual])
     gain = float((scores[likeliest] - scores[usual]).sum()) / part.moved.size
-    if likeliest == usual or margin < CLEAR or gain < LEAST_NATS:
+    # A body that only turns about one point does so along any heading.
+    if likeliest == usual or min(margin, abs(pulls[likeliest])) < CLEAR or gain < LEAST_NATS:
         # Where wheels spin, the body may go along any of them.
         pull = pulls[False, 90.0]
         is_open = abs(pulls[usual]) < CLEAR < abs(pull)

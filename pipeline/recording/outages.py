@@ -344,7 +344,8 @@ def _list_dead(
         inside = (ends[:-1][part] >= span.start + delay) & (ends[:-1][part] < span.end + delay)
         rows = np.arange(part.start, part.stop)[inside]
         columns = [each[rows] for each in sources]
-        if goes_on[rows].sum() > price and not _follows_otherwise(
+        should_turn = _should_turn(one.fits[0].expected[rows], one.top) and goes_on[rows].sum() > price
+        if should_turn and not _follows_otherwise(
             one.values[rows], columns, one.fits, span, 2.0 * price, track_m
         ):
             made.append(span)
@@ -440,6 +441,11 @@ def _rate_repeating(values: Floats, fits: Sequence[_Follows]) -> Floats:
     return list_likelihoods(np.diff(values, prepend=values[0]), min(one.scale for one in fits))
 
 
+def _should_turn(expected: Floats, top: float) -> bool:
+    """Whether the wheels of a side should turn for long enough in some blocks."""
+    return bool((np.abs(expected) > LIVE_SHARE * top).sum() * BLOCK_S > 0.5 * _SILENT_S)
+
+
 def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: float) -> list[Outage]:
     """Silences of a side in which it should turn."""
     steps = blocks.steps
@@ -449,7 +455,7 @@ def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: 
     for index in np.flatnonzero(np.diff(edges) > _SILENT_S).tolist():
         start, end = edges[index], edges[index + 1]
         inside = (begins >= start) & (begins + BLOCK_S <= end)
-        if (np.abs(expected[inside]) > LIVE_SHARE * top).sum() * BLOCK_S > 0.5 * _SILENT_S:
+        if _should_turn(expected[inside], top):
             is_first, is_last = index == 0, index == side.times.size
             made.append(
                 Outage(
