@@ -536,7 +536,7 @@ def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
         motions = zip(places, headings, speeds, rates, strict=True)
         poses = dict(zip(times[1:].tolist(), motions, strict=True))
         stands = _die("left", None, begins)(log, roles)
-        span = abs(metres / turn)
+        span = _fit_span(log, roles, wheels)
 
         def change(one: Message) -> Message | None:
             if one.topic.endswith("tf_static"):
@@ -552,6 +552,33 @@ def _pivot(begins: float) -> Callable[[Log, Roles], Log | None]:
         return None if stands is None else _each(stands, change)
 
     return make
+
+
+def _fit_span(log: Log, roles: Roles, wheels: dict[str, tuple[Any, Any]]) -> float:
+    """Distance [m] of the sides by which a controller turns body commands into wheel speeds."""
+    asked = [
+        (one.log_time, twist["linear"]["x"], twist["angular"]["z"])
+        for one in log.messages
+        if one.topic in roles.command and "linear" in (twist := _find_twist(_copy(one.content)))
+    ]
+    if len(asked) < _FEWEST:
+        return 0.0
+    times, ahead, turn = np.array(asked).T
+    left, right = (np.diff(np.interp(times, *wheels[side])) for side in ("left", "right"))
+    elapsed = np.diff(times) / 1e9
+    ratios = [
+        float(drive @ one / (one @ one))
+        for drive, one in ((0.5 * (left + right), ahead[:-1] * elapsed), (right - left, turn[:-1] * elapsed))
+    ]
+    return ratios[1] / ratios[0]
+
+
+_FEWEST = 100
+"""Commands from which on their scale can be read."""
+
+
+def _find_twist(content: Content) -> Content:
+    return content.get("twist", content) if isinstance(content, dict) else {}
 
 
 def _read_sides(log: Log, roles: Roles) -> dict[str, tuple[Any, Any]] | None:
@@ -595,8 +622,7 @@ def _move(one: Message, motion: tuple[complex, float, complex, float]) -> Messag
 def _command_right(one: Message, span: float) -> Message:
     """A command of which the left wheels get nothing, on wheels that are a span [m] apart."""
     content = _copy(one.content)
-    if isinstance(content, dict) and ("linear" in content or "twist" in content):
-        twist = content.get("twist", content)
+    if "linear" in (twist := _find_twist(content)):
         right = twist["linear"]["x"] + 0.5 * span * twist["angular"]["z"]
         twist["linear"]["x"], twist["angular"]["z"] = 0.5 * right, right / span
         return replace(one, content=content)

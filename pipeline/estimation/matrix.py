@@ -326,10 +326,10 @@ class Matrix:
             excluded: ids of effects that are in none.
         """
         start, now = self.measure(Move()), Move().drop(*{*self.fit.ids}.intersection(excluded))
-        steps, seen = list[Move](), {now}
+        steps, seen = list[Move](), {now: None}
         while True:
             moves = dict.fromkeys(self._list_moves(now, given, excluded))
-            seen.update(moves)
+            seen |= moves
             best = min(moves, key=self.measure, default=now)
             if not self.measure(best) < self.measure(now) - _FALL:
                 break
@@ -359,7 +359,8 @@ class Matrix:
             yield rest
             yield from (self.add(other, to=rest) for other in range(len(ids)) if ids[other] == ids[index])
             yield from (self.add(other, to=rest) for other in new)
-        yield from (Move(now.gone - {name}, now.added) for name in now.gone.difference(excluded))
+        back = [name for name in self.fit.ids if name in now.gone and name not in excluded]
+        yield from (Move(now.gone - {name}, now.added) for name in back)
         yield from (self.add(index, to=now) for index in new)
         for name in stay:
             yield now.drop(name)

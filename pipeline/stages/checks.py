@@ -44,7 +44,9 @@ def check_side_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
     # Without turning and without a command, noise has no sign.
     live = np.any([np.abs(side).max(axis=1) > _LIVE for side in sides.values()], axis=0)
-    if live.sum() < FEWEST_SAMPLES:
+    # Wheels that stand have no scale.
+    turns = np.abs(sides["wheels"]) > _LIVE
+    if min(live.sum(), *turns.sum(axis=0)) < FEWEST_SAMPLES:
         return []
     sides = {name: side[live] for name, side in sides.items()}
     turned = sides["pose"][:, 1] - sides["pose"][:, 0]

@@ -21,6 +21,7 @@ from pipeline.words import format_finding
 
 ROOT = Path(__file__).parents[2]
 CASES = ROOT / ".." / "shared" / "cases"
+RECORDED = ROOT / ".." / "shared" / "logs" / "warthog_wheels_asphalt_2024_9_20_8h13s12.mcap"
 CHANGES = {change.name: change for change in list_changes()}
 # Wheel commands beside body commands, a car by its joints, a vehicle that nothing names, poses in transforms.
 SAMPLES = ("husky_tile", "ackermann_gravel", "turtlebot4", "nav2")
@@ -261,3 +262,15 @@ def test_cases_of_the_field_say_what_they_must(tmp_path: Path) -> None:
         if not re.search(must, text) or (never and re.search(never, text)):
             wrong.append(name)
     assert len(wrong) <= 2, wrong
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not RECORDED.exists(), reason="../shared/logs is not here")
+@pytest.mark.parametrize("change", ["pivots about the left wheels", "nothing but such pivots"])
+def test_a_recording_of_pivots_has_no_dead_encoder(change: str, tmp_path: Path) -> None:
+    """Between long rests, on ground where wheels slip aside."""
+    made = CHANGES[change].make(read(RECORDED), find_roles(RECORDED))
+    assert made is not None
+    after = ask(write(made, tmp_path / RECORDED.name))
+    assert after.medians
+    assert judge(CHANGES[change], ask(RECORDED), after) == "same"
