@@ -174,7 +174,9 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     planned, settled, notes = make_plan(listed, store, request)
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
     skipped = [each for each in listed.skipped if str(each.path) not in ignored]
-    unseen: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
+    unseen: list[JSON] = [
+        {"path": str(each.path), "reason": each.reason, "hint": each.hint} for each in skipped
+    ]
     note: dict[str, JSON] = {"began": began, "at": None, "left_out": unseen}
     if request.targets:
         _note_batch(store, note)
@@ -215,7 +217,9 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     ]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
     lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
-    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in skipped]
+    lines += [
+        Line(path=str(each.path), state="left_out", reason=each.reason, hint=each.hint) for each in skipped
+    ]
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,

@@ -391,7 +391,8 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     folder, name = LAST_BATCH
     known = {one["path"] for one in noted}
     noted += [
-        {"path": str(one["path"]), "state": "left_out", "reason": str(one["reason"]), "hint": ""}
+        {"path": str(one["path"]), "state": "left_out"}
+        | {key: str(one.get(key) or "") for key in ("reason", "hint")}
         for one in objects_in(store.notes(folder).read(name) or {}, "left_out")
         if one.get("path") not in known
     ]
