@@ -9,15 +9,16 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
 from pipeline.batch import Request, Shard, Stop
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
-from pipeline.batch.recordings import find_recordings
+from pipeline.batch.recordings import Recordings, find_recordings
 from pipeline.core import SlipError, format_count
-from pipeline.report import mark_batch
+from pipeline.report import list_noted, mark_batch
 from pipeline.store import JSON, LAST_BATCH, Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
@@ -55,7 +56,8 @@ class Line:
         run: name of its run.
         state: the one of `STATES` under which it is counted and listed: what its results are, new or not. A
             log without losses is ``unchanged`` where there was nothing to do; ``left_out`` is a path that
-            cannot be read, for example a folder without permission or a pipe.
+            cannot be read, for example a folder without permission or a pipe, and ``gone`` a log with
+            results that is not there any more.
         code: code of the error.
         reason: why it failed or cannot show slip, or what was lost.
         hint: what to do.
@@ -142,8 +144,12 @@ class Outcome:
 
     @property
     def has_losses(self) -> bool:
-        """Whether a log had losses, cannot show slip, failed and is unchanged, or could not be read."""
-        return any(line.state in {"lossy", "refused", "left_out", *FAILED_STATES} for line in self.lines)
+        """Whether a log had losses, cannot show slip, failed before, could not be read, or is newly gone."""
+        # The results of a log that is gone are whole: once is enough.
+        lasting = {"lossy", "refused", "left_out", *FAILED_STATES}
+        return any(
+            line.state in lasting or (line.state == "gone" and not line.unchanged) for line in self.lines
+        )
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
@@ -210,16 +216,21 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     # Only an error that affects every log, or a signal, leaves some.
     cause = STOPPED if stopped else next((line.reason for line in lines if line.code in STOPPING), "")
     known = {line.path for line in lines}
-    lines += [
+    waiting = [
         Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
         for one in todo
         if one.log.path not in known
     ]
     why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
-    lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
-    lines += [
+    lines += [*waiting, *(Line(path=str(path), state="growing", reason=why) for path in listed.growing)]
+    absent = [
         Line(path=str(each.path), state="left_out", reason=each.reason, hint=each.hint) for each in skipped
     ]
+    # Whether a log is gone or was moved is known when all logs were worked on.
+    absent += [] if waiting else _find_gone(store, listed, request.shard)
+    lines += _mark_named(store, absent)
+    if not waiting:
+        _forget_named(store, absent, listed, request.shard)
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -228,6 +239,46 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         notes=tuple(notes),
         stopped=stopped,
     )
+
+
+_NAMED = "batch/absent"
+"""Folder of the notes on paths without a log that a batch has named."""
+
+
+def _find_gone(store: Store, listed: Recordings, shard: Shard | None) -> list[Line]:
+    """Logs with results that this batch would have found if they were still there."""
+    runs = {path: entry.run for path, entry in Ledger(store).read_all().items()}
+    return [
+        Line(path=one["path"], run=runs[one["path"]], state="gone", reason=one["reason"])
+        for one in list_noted(store)
+        if one["state"] == "gone"
+        and listed.would_list(Path(one["path"]))
+        and _is_own(runs[one["path"]], shard)
+    ]
+
+
+def _mark_named(store: Store, absent: Sequence[Line]) -> list[Line]:
+    """Lines of paths without a log: unchanged where an earlier batch has said the same; remembered."""
+    notes = store.notes(_NAMED)
+    marked: list[Line] = []
+    for line in absent:
+        note = {"path": line.path, "run": line.run, "reason": line.reason}
+        is_old = notes.read(line.path) == note
+        if not is_old:
+            with suppress(SlipError):
+                notes.write(line.path, note)
+        marked.append(replace(line, unchanged=is_old))
+    return marked
+
+
+def _forget_named(store: Store, absent: Sequence[Line], listed: Recordings, shard: Shard | None) -> None:
+    """Forget which paths had no log where that is over."""
+    notes = store.notes(_NAMED)
+    now = {line.path for line in absent}
+    for note in list(notes.read_all()):
+        path = str(note.get("path"))
+        if path not in now and listed.would_list(Path(path)) and _is_own(str(note.get("run")), shard):
+            notes.remove(path)
 
 
 def _note_batch(store: Store, note: dict[str, JSON]) -> None:
@@ -316,12 +367,16 @@ def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int
 
 
 def _select(todo: Sequence[Task], shard: Shard | None) -> list[Task]:
-    """Logs of this machine: selected by the run's name, so that machines need no communication."""
+    """Logs of this machine."""
+    return [task for task in todo if _is_own(task.run, shard)]
+
+
+def _is_own(run: str, shard: Shard | None) -> bool:
+    """Whether a run is this machine's: by its name, so that machines need no communication."""
     if shard is None:
-        return list(todo)
-    digests = [hashlib.sha256(task.run.encode()).digest() for task in todo]
-    numbers = [int.from_bytes(digest[:8], "big") % shard.count + 1 for digest in digests]
-    return [task for task, number in zip(todo, numbers, strict=True) if number == shard.number]
+        return True
+    digest = hashlib.sha256(run.encode()).digest()
+    return int.from_bytes(digest[:8], "big") % shard.count + 1 == shard.number
 
 
 def _settle(entry: Entry) -> Line:

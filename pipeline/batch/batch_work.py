@@ -24,7 +24,7 @@ from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Sto
 # A ledger entry counts only if the results confirm it: a log is done only while the results contain the
 # generation named in its entry. A lost entry costs one reading of the log.
 
-STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "not_started")
+STATES = ("done", "unchanged", *LOG_STATES[1:], "growing", "not_started")
 """What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 

@@ -70,12 +70,14 @@ class Looker:
         patience_s: time limit of one access [s].
         skipped: paths that could not be read.
         tops: folders that were asked for; links resolved.
+        globs: globs that were asked for, absolute.
         links: the link by which each path outside of them was found.
     """
 
     patience_s: float
     skipped: list[Skipped] = field(default_factory=list)
     tops: list[Path] = field(default_factory=list)
+    globs: list[str] = field(default_factory=list)
     links: dict[Path, Path] = field(default_factory=dict)
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
@@ -222,6 +224,7 @@ class Recordings:
         skipped: skipped paths with reasons: folders that cannot be read, pipes, broken links.
         links: the link by which each path outside of the folders was found.
         tops: the folders that were searched.
+        globs: the globs that were expanded, absolute.
     """
 
     recordings: tuple[Path, ...]
@@ -229,10 +232,18 @@ class Recordings:
     skipped: tuple[Skipped, ...] = field(default=())
     links: Mapping[Path, Path] = field(default_factory=dict, compare=False)
     tops: tuple[Path, ...] = field(default=(), compare=False)
+    globs: tuple[str, ...] = field(default=(), compare=False)
 
     def covers(self, folder: Path) -> bool:
         """Whether all recordings in a folder and below it were looked for."""
         return any(folder.resolve().is_relative_to(top) for top in self.tops)
+
+    def would_list(self, path: Path) -> bool:
+        """Whether a recording would have been found if it were there."""
+        names = (path, self.name_listed(path))
+        return any(name.is_relative_to(top) for name in names for top in self.tops) or any(
+            fnmatch.fnmatchcase(str(name), glob) for name in names for glob in self.globs
+        )
 
     def name_listed(self, path: Path) -> Path:
         """The path of a recording as its folder lists it: by the links that lead to it."""
@@ -273,6 +284,7 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         tuple(skipped[path] for path in sorted(skipped)),
         looker.links,
         tuple(looker.tops),
+        tuple(looker.globs),
     )
 
 
@@ -341,6 +353,7 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
         for folder in looker.walk(real):
             yield from _list_recordings(folder, looker)
     elif _GLOB.search(target):
+        looker.globs.append(str(path.absolute()))
         for match in looker.expand(path):
             yield from _find_match(match, looker)
     elif real is not None and looker.ask(real, real.exists):

@@ -15,8 +15,6 @@ from pipeline.report import _date_errors, render_catalogue
 from pipeline.sources import ConfigurationError, match_ignored
 from pipeline.store import LOG_STATES, Store
 
-STATES = [state for state in LOG_STATES if state != "gone"]
-
 
 @pytest.fixture
 def folder(place: Path) -> Path:
@@ -36,17 +34,17 @@ def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
     for number in range(2):
         told = json.loads(run_verb(*words, cwd=folder).stdout)
         status = json.loads(run_verb("results", "status", "--results", "season", "--json", cwd=folder).stdout)
-        counts = {state: told[state] for state in STATES}
+        counts = {state: told[state] for state in LOG_STATES}
         counts["done"] += told["unchanged"]
-        assert counts == {state: status[state] for state in STATES}, number
+        assert counts == {state: status[state] for state in LOG_STATES}, number
         expected = {"done": 1, "lossy": 1, "failed": 1, "copy": 1, "ignored": 1}
         assert {state: count for state, count in counts.items() if count} == expected
         assert len(told["logs"]) == sum(counts.values())
         states = [one["state"] for one in told["logs"]]
         assert {state: told[state] for state in states} == {state: states.count(state) for state in states}
     sent = json.loads((folder / "told.json").read_text())
-    assert {state: sent[state] for state in STATES if state != "done"} == {
-        state: counts[state] for state in STATES if state != "done"
+    assert {state: sent[state] for state in LOG_STATES if state != "done"} == {
+        state: counts[state] for state in LOG_STATES if state != "done"
     }
     page = unescape((folder / "season" / "index.html").read_text())
     (line,) = re.findall(r"Logs of batches: (.*)\.</p>", page)
