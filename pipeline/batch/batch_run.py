@@ -18,7 +18,7 @@ from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_
 from pipeline.batch.executors import Limits, find_blame, open_executor
 from pipeline.batch.recordings import Recordings, find_recordings
 from pipeline.core import SlipError, format_count
-from pipeline.report import list_noted, mark_batch
+from pipeline.report import list_noted, mark_batch, note_vehicles
 from pipeline.store import JSON, LAST_BATCH, Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
@@ -231,6 +231,8 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     lines += _mark_named(store, absent)
     if not waiting:
         _forget_named(store, absent, listed, request.shard)
+    runs = {line.run for line in lines}
+    notes += note_vehicles(one for one in store.survey().manifests if one.run in runs)
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,

@@ -164,3 +164,19 @@ def test_links_are_ignored_as_they_are_listed(folder: Path) -> None:
     words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season", "--json")
     told = json.loads(run_verb(*words, cwd=folder).stdout)
     assert (told["ignored"], told["left_out"]) == (4, 0)
+
+
+def test_logs_of_another_vehicle_than_the_stated_one_are_named(season: Path, tmp_path: Path) -> None:
+    """By the batch, every night, and by the index; the results stand."""
+    (season / "fleet.toml").write_text('[vehicle]\npreset = "husky_a200"\n')
+    words = ("batch", season, "--settle", "0", "--executor", "inline", "--results", "out")
+    for _ in range(2):
+        (note,) = json.loads(run_verb(*words, "--json", cwd=tmp_path).stdout)["notes"]
+        assert note.startswith(
+            "1 log indicates a Clearpath Warthog, and not the Clearpath Husky A200 that is"
+        )
+        assert "season/d; check [vehicle]" in note
+    assert note in unescape((tmp_path / "out" / "index.html").read_text())
+    (season / "fleet.toml").unlink()
+    assert json.loads(run_verb(*words, "--json", cwd=tmp_path).stdout)["notes"] == []
+    assert "indicates a" not in (tmp_path / "out" / "index.html").read_text()
