@@ -265,13 +265,15 @@ def _is_settled(
 ) -> bool:
     """Whether there is nothing to do for a log that a batch has seen before."""
     entry = task.before
-    if entry is None or not entry.fits(task.log, task.fingerprint) or request.options.force:
+    manifest = None if entry is None else manifests.get(entry.run)
+    is_asked_for = request.options.force or (manifest is not None and manifest.again)
+    if entry is None or not entry.fits(task.log, task.fingerprint) or is_asked_for:
         return False
-    manifest = manifests.get(entry.run)
-    if manifest is not None and manifest.again:
-        return False
-    if entry.lasts or entry.state == "quarantined":
-        return entry.lasts or not request.retries_quarantined
+    if entry.state == "quarantined":
+        # With more time or memory than it has exceeded it may come to an end.
+        return not request.retries_quarantined and request.find_limit(entry.code) <= entry.limit
+    if entry.lasts:
+        return True
     if entry.state == "copy":
         original = manifests.get(entry.reason)
         log = {} if original is None else original.part("log")

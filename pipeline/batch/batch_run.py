@@ -29,6 +29,12 @@ STOPPED = "the batch was stopped"
 FAILED_STATES = ("failed", "quarantined", "not_started")
 """States of logs that should have results and have none."""
 
+_RETRY = "It is skipped until it changes; --retry-quarantined tries it again"
+_RETRIES = {
+    "timed_out": "It is skipped until it changes or --timeout is longer; --retry-quarantined tries it again",
+    "out_of_memory": "It is skipped until it changes or has more memory (--memory, or fewer --jobs); "
+    "--retry-quarantined tries it again",
+}
 _BUSY_PAUSE_S = 0.25
 _FATAL_KILLS = 2
 """Number of killed workers after which a log is quarantined until it, or its fingerprint, changes."""
@@ -316,7 +322,8 @@ def _work_through(
                 try:
                     report = future.result()
                 except (Exception, CancelledError) as error:  # noqa: BLE001 - whatever a worker can die of
-                    report = Report(entry=_judge(task, *find_blame(task, error), ledger))
+                    code, reason = find_blame(task, error)
+                    report = Report(entry=_judge(task, code, reason, request.find_limit(code), ledger))
                     if report.entry.kills == 1:
                         (suspects if executor.spreads_blame else queue).append(task)
                         continue
@@ -331,8 +338,11 @@ def _work_through(
         executor.close()
 
 
-def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
-    """Entry of a log whose worker was lost: failed at first, then quarantined until it changes."""
+def _judge(task: Task, code: str, reason: str, limit: float, ledger: Ledger) -> Entry:
+    """Entry of a log whose worker was lost: failed at first, then quarantined until it changes.
+
+    One that exceeded a limit also leaves the quarantine when that limit is raised.
+    """
     before = ledger.read(task.log.path)
     is_known = before is not None and before.state == "failed" and before.fits(task.log, task.fingerprint)
     kills = 0 if code in STOPPING else 1 + (before.kills if before is not None and is_known else 0)
@@ -344,10 +354,9 @@ def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
         run=task.run,
         code=code,
         reason=f"{reason}; {kills} times" if quarantined else reason,
-        hint="It is skipped until it changes; --retry-quarantined tries it again"
-        if quarantined
-        else "Run the same command again",
+        hint=_RETRIES.get(code, _RETRY) if quarantined else "Run the same command again",
         kills=kills,
+        limit=limit,
     )
     ledger.write(entry)
     return entry

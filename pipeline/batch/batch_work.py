@@ -69,6 +69,7 @@ class Entry:
         hint: what to do about it.
         lasts: whether an error stays until the log or its fingerprint changes (`judge_error`).
         kills: number of workers it has killed in this state.
+        limit: of a log that exceeded its time [s] or memory [bytes], that limit.
         has_report: whether the generation contains a report.
         seconds: processing time.
         peak_bytes: peak memory of its worker.
@@ -85,6 +86,7 @@ class Entry:
     hint: str = ""
     lasts: bool = False
     kills: int = 0
+    limit: float = 0.0
     has_report: bool = False
     seconds: float = 0.0
     peak_bytes: int = 0
