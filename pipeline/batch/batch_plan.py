@@ -39,7 +39,7 @@ from schemas import contract_of, list_contracts
 # It covers more than the keys of the stages, so that it is available without opening the log. If it differs,
 # the keys decide what has to be computed.
 
-_WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")
+_WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "listed", "report", "figures", "force")
 """Options without influence on the tables, or whose content is hashed separately."""
 
 
@@ -57,10 +57,12 @@ class Fingerprinter:
         self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _fingerprint_program()])
         self._contents: dict[Path, str] = {}
 
-    def find_fingerprint(self, log: Path) -> str:
-        """That of one log."""
-        files = list_configuration_files(log, given=self._options.config, fleet=self._options.fleet)
-        return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files]])
+    def find_fingerprint(self, log: Path, listed: Path | None = None) -> str:
+        """That of one log; ``listed`` is its path by the links that lead to it, if there are any."""
+        given, fleet = self._options.config, self._options.fleet
+        files = list_configuration_files(log, given=given, fleet=fleet, listed=listed)
+        names = [] if listed is None else [str(listed)]
+        return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files], *names])
 
     def _hash_content(self, file: Path) -> str:
         known = self._contents.get(file)
@@ -197,7 +199,7 @@ def make_plan(
     settled = [_ignore(path, why, ledger, store) for path, why in ignored.items()]
     paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
-    tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
+    tasks = [_look_at(path, listed.name_listed(path), hasher, ledger, request.options) for path in paths]
     owners = _find_owners(tasks, manifests)
     settled += [
         task.before for task in tasks if task.before and _is_settled(task, manifests, owners, request)
@@ -240,12 +242,15 @@ def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> 
     return entry
 
 
-def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options) -> Task:
+def _look_at(
+    path: Path, shown: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options
+) -> Task:
     # Unreadable logs are processed all the same: this reports what is wrong with them.
     log, fingerprint = see_nothing(str(path)), ""
+    options = replace(options, listed=None if shown == path else shown)
     with suppress(OSError, SlipError):
         log = see_log(path)
-        fingerprint = hasher.find_fingerprint(path)
+        fingerprint = hasher.find_fingerprint(path, options.listed)
     before = ledger.get(log.path)
     return Task(path=path, log=log, fingerprint=fingerprint, options=options, before=before)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from pipeline.core import TomlError, parse_toml, read_bounded_text, require_finite, shorten
-from pipeline.logs import stem_of
+from pipeline.logs import RemotePath, stem_of
 from pipeline.sources.configuration import (
     Configuration,
     ConfigurationError,
@@ -227,29 +227,35 @@ _PLAN = re.compile(rb'(?:\s|#[^\n]*\n)*vehicle = "[^\n]*\nruns = ')
 
 
 def load_configuration(
-    log: Path, *, given: Path | None = None, fleet: Path | None = None, overrides: Tree | None = None
+    log: Path,
+    *,
+    given: Path | None = None,
+    fleet: Path | None = None,
+    listed: Path | None = None,
+    overrides: Tree | None = None,
 ) -> Configuration:
     """The configuration of one log.
 
     Every `fleet.toml` from the root of the file system down to the log's folder is read, nearer ones with
-    priority, then the given fleet file; then `run.toml` and `<log's stem>.toml` beside the log and `run.toml`
-    in a log that is a folder, or the file given instead; then overrides. A model file or a plan of that name
-    is skipped.
+    priority, with those above the links that lead to it, then the given fleet file; then `run.toml` and
+    `<log's stem>.toml` beside the log and `run.toml` in a log that is a folder, or the file given instead;
+    then overrides. A model file or a plan of that name is skipped.
 
     Args:
         log: the recording.
         given: a configuration file that replaces the one beside the log.
         fleet: a fleet file that need not be above the log; its globs are matched against every end of the
             log's path that begins with a whole folder.
+        listed: path of the log by the links that lead to it; None for the path that is given.
         overrides: values from the command line, nested like the file.
 
     Raises:
         ConfigurationError: a file is missing, not TOML, or has an unknown key or a wrong value.
     """
     layers: list[Tree] = []
-    for path in list_configuration_files(log, given=given, fleet=fleet):
+    for path in list_configuration_files(log, given=given, fleet=fleet, listed=listed):
         if path == fleet or (path.name == FLEET_FILE and path != given):
-            layers += _match_fleet(path, log.resolve())
+            layers += _match_fleet(path, (_follow(log), _keep_links(listed or log)))
         else:
             layers.append(_checked(read_toml(path), path))
     if overrides:
@@ -258,33 +264,44 @@ def load_configuration(
 
 
 def list_configuration_files(
-    log: Path, *, given: Path | None = None, fleet: Path | None = None
+    log: Path, *, given: Path | None = None, fleet: Path | None = None, listed: Path | None = None
 ) -> tuple[Path, ...]:
     """Files that configure a log, later ones with priority; arguments as of `load_configuration`.
 
     A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
     may create one in a folder like `/tmp`.
     """
-    path = _resolve(log)
+    path = _follow(log)
     beside = [path.parent / RUN_FILE, path.parent / f"{stem_of(log)}.toml"]
     folder = path if path.is_dir() else path.parent
     if folder == path:
         beside.append(folder / RUN_FILE)
-    fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
-    files = [
-        file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
+    shown = _keep_links(listed or log)
+    above = [*reversed(path.parents), *reversed(shown.parents), *([path] if folder == path else [])]
+    fleets = [
+        _follow(place / FLEET_FILE)
+        for place in dict.fromkeys(above)
+        if _may_speak(place / FLEET_FILE, folder)
     ]
+    # Of a file that is above both, its nearer place counts.
+    fleets = list(dict.fromkeys(reversed(fleets)))[::-1]
+    files = [file for file in fleets if fleet is None or file != _follow(fleet)]
     files += [] if fleet is None else [fleet]
     own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
     return (*files, *(own if given is None else [given]))
 
 
-def _resolve(log: Path) -> Path:
+def _follow(log: Path) -> Path:
     """The path of a log, links resolved; a link to itself, which may be ignored, stays as it is."""
     try:
         return log.resolve()
     except RuntimeError:
         return log
+
+
+def _keep_links(log: Path) -> Path:
+    """The absolute path of a log, by the links that lead to it."""
+    return log if isinstance(log, RemotePath) else Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
 
 
 def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
@@ -393,13 +410,13 @@ def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
     return tree
 
 
-def _match_fleet(path: Path, log: Path) -> list[Tree]:
-    """Layers of a fleet file for one log: its plain keys, then every match in order."""
+def _match_fleet(path: Path, log: tuple[Path, Path]) -> list[Tree]:
+    """Layers of a fleet file for one log, by both of its paths: its plain keys, then every match in order."""
     tree = read_toml(path)
     tree.pop("ignore", None)
     matches = tree.pop("match", [])
     layers: list[Tree] = [_checked(tree, path)]
-    names = _names_under(path.resolve().parent, log)
+    names = [name for one in log for name in _names_under(path.resolve().parent, one)]
     if not isinstance(matches, list):
         raise _bad_match(path, 1)
     for number, match in enumerate(matches, start=1):
@@ -423,11 +440,8 @@ def match_ignored(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str]
         ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
     matches: dict[tuple[Path, str], bool] = {}
-    # As it is listed: a link in the folder of the fleet file may lead out of it.
-    listed = Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
-    above = [folder / FLEET_FILE for folder in reversed(listed.parents)]
-    files = [file for file in above if file.is_file() and _may_speak(file, listed.parent)]
-    for path in dict.fromkeys([*files, *list_configuration_files(log, fleet=fleet)]):
+    paths = (_follow(log), _keep_links(log))
+    for path in list_configuration_files(log, fleet=fleet):
         if path != fleet and path.name != FLEET_FILE:
             continue
         globs = read_toml(path).get("ignore", [])
@@ -436,9 +450,7 @@ def match_ignored(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str]
             raise ConfigurationError(
                 "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
-        names = _names_under(path.parent.absolute(), listed) + _names_under(
-            path.resolve().parent, _resolve(log)
-        )
+        names = [name for one in paths for name in _names_under(path.resolve().parent, one)]
         matches |= {(path, glob): any(fnmatch.fnmatchcase(name, glob) for name in names) for glob in globs}
     return matches
 

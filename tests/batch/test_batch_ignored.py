@@ -180,3 +180,28 @@ def test_logs_of_another_vehicle_than_the_stated_one_are_named(season: Path, tmp
     (season / "fleet.toml").unlink()
     assert json.loads(run_verb(*words, "--json", cwd=tmp_path).stdout)["notes"] == []
     assert "indicates a" not in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_fleet_file_reaches_the_logs_behind_a_link(season: Path, tmp_path: Path) -> None:
+    """As they are listed: by its plain keys and by the globs of its matches."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "husky_7").symlink_to(season)
+    (season / "b.mcap").rename(tmp_path / "b.mcap")
+    (logs / "one.mcap").symlink_to(tmp_path / "b.mcap")
+    match = '[[match]]\nglob = "husky_7/*"\n[match.run]\nterrain = "clay"\n'
+    (logs / "fleet.toml").write_text(f'[run]\nterrain = "mud"\n{match}')
+    words = ("batch", "logs", "--settle", "0", "--executor", "inline", "--results", "out")
+    for _ in range(2):
+        run_verb(*words, cwd=tmp_path)
+        runs = Store(tmp_path / "out").query("SELECT run, terrain FROM runs ORDER BY run")
+        assert {run[-1]: terrain for run, terrain in runs.rows()} == {"b": "mud"} | dict.fromkeys(
+            "acd", "clay"
+        )
+    (logs / "fleet.toml").write_text('[run]\nterrain = "mud"\n')
+    (season / "fleet.toml").write_text('[run]\ndataset = "near"\n')
+    run_verb(*words, cwd=tmp_path)
+    runs = Store(tmp_path / "out").query("SELECT terrain, dataset FROM runs")
+    assert sorted(runs.rows())[1:] == [("mud", "near")] * 3
+    run_verb("analyze", "logs/husky_7/a.mcap", "--results", "other", "--no-report", cwd=tmp_path)
+    assert Store(tmp_path / "other").query("SELECT terrain FROM runs")["terrain"].to_list() == ["mud"]
