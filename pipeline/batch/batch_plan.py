@@ -19,7 +19,7 @@ from pipeline.batch.recordings import Recordings
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
-from pipeline.sources import list_configuration_files, list_presets, match_ignored, read_tables
+from pipeline.sources import list_configuration_files, list_presets, match_globs, read_tables
 from pipeline.store import (
     LogIdentities,
     Manifest,
@@ -181,20 +181,21 @@ def make_plan(
     odd = [each.path for each in listed.skipped if each.is_entry]
     fleet = request.options.fleet
     matches = {
-        path: match_ignored(listed.name_listed(path), fleet)
+        path: match_globs(listed.name_listed(path), fleet)
         for path in (*listed.recordings, *listed.growing, *odd)
     }
     ignored = {
         path: _format_rule(*rules[0])
         for path, matching in matches.items()
-        if path not in listed.growing and (rules := [rule for rule, fits in matching.items() if fits])
+        if path not in listed.growing
+        and (rules := [rule for rule, fits in matching.items() if fits and rule[1] == "ignore"])
     }
     used = {rule for matching in matches.values() for rule, fits in matching.items() if fits}
     # Of the logs of a folder that was not asked for, only some are known.
     unused = [
-        f"{_format_rule(file, glob)} matched no log"
-        for file, glob in dict.fromkeys(rule for matching in matches.values() for rule in matching)
-        if (file, glob) not in used and (file == fleet or listed.covers(file.parent))
+        f"{_format_rule(*rule)} matched no log"
+        for rule in dict.fromkeys(rule for matching in matches.values() for rule in matching)
+        if rule not in used and (rule[0] == fleet or listed.covers(rule[0].parent))
     ]
     settled = [_ignore(path, why, ledger, store) for path, why in ignored.items()]
     paths = [path for path in listed.recordings if path not in ignored]
@@ -221,8 +222,8 @@ def make_plan(
     return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled, unused
 
 
-def _format_rule(file: Path, glob: str) -> str:
-    return f'{file}: ignore = "{glob}"'
+def _format_rule(file: Path, kind: str, glob: str) -> str:
+    return f'{file}: {"ignore" if kind == "ignore" else "[[match]] glob"} = "{glob}"'
 
 
 def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> Entry:

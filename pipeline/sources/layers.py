@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from pipeline.core import TomlError, parse_toml, read_bounded_text, require_finite, shorten
+from pipeline.core import TomlError, objects_in, parse_toml, read_bounded_text, require_finite, shorten
 from pipeline.logs import RemotePath, stem_of
 from pipeline.sources.configuration import (
     Configuration,
@@ -429,29 +429,40 @@ def _match_fleet(path: Path, log: tuple[Path, Path]) -> list[Tree]:
     return layers
 
 
-def match_ignored(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str], bool]:
-    """Globs of logs that a batch ignores, with their fleet file, and whether they match a log.
+def match_globs(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str, str], bool]:
+    """Globs of the fleet files of a log, and whether they match it.
 
     Args:
-        log: the recording.
+        log: the recording, by the links that lead to it.
         fleet: a fleet file that need not be above the log.
+
+    Returns:
+        By the file, ``ignore`` (a batch does not open the log) or ``match``, and the glob.
 
     Raises:
         ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
-    matches: dict[tuple[Path, str], bool] = {}
+    matches: dict[tuple[Path, str, str], bool] = {}
     paths = (_follow(log), _keep_links(log))
     for path in list_configuration_files(log, fleet=fleet):
         if path != fleet and path.name != FLEET_FILE:
             continue
-        globs = read_toml(path).get("ignore", [])
-        if not isinstance(globs, list) or not all(isinstance(one, str) for one in globs):
+        tree = read_toml(path)
+        ignored = tree.get("ignore", [])
+        if not isinstance(ignored, list) or not all(isinstance(one, str) for one in ignored):
             hint = 'Write: ignore = ["2026/dead.mcap", "*/tests/*"], above the first [table].'
             raise ConfigurationError(
                 "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
+        # What is wrong with a match is told when it is applied.
+        matched = [one.get("glob") for one in objects_in(tree, "match")]
+        rules = [*(("ignore", glob) for glob in ignored), *(("match", glob) for glob in matched)]
         names = [name for one in paths for name in _names_under(path.resolve().parent, one)]
-        matches |= {(path, glob): any(fnmatch.fnmatchcase(name, glob) for name in names) for glob in globs}
+        matches |= {
+            (path, kind, glob): any(fnmatch.fnmatchcase(name, glob) for name in names)
+            for kind, glob in rules
+            if isinstance(glob, str)
+        }
     return matches
 
 

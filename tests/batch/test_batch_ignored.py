@@ -12,7 +12,7 @@ import pytest
 from verbs import run_verb
 
 from pipeline.report import _date_errors, render_catalogue
-from pipeline.sources import ConfigurationError, match_ignored
+from pipeline.sources import ConfigurationError, match_globs
 from pipeline.store import LOG_STATES, Store
 
 
@@ -108,7 +108,7 @@ def test_a_log_that_is_no_longer_ignored_is_read(folder: Path) -> None:
 def test_ignore_is_a_list_of_globs(tmp_path: Path) -> None:
     (tmp_path / "fleet.toml").write_text("ignore = 3\n")
     with pytest.raises(ConfigurationError, match="list of globs"):
-        match_ignored(tmp_path / "a.mcap")
+        match_globs(tmp_path / "a.mcap")
 
 
 def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> None:
@@ -151,6 +151,21 @@ def test_a_glob_that_matches_no_log_is_told(folder: Path) -> None:
     )
     one = json.loads(run_verb("batch", "field/text.mcap", *words, "--json", cwd=folder).stdout)
     assert one["notes"] == []
+
+
+def test_a_match_that_fits_no_log_is_told(folder: Path) -> None:
+    fleet = folder / "field" / "fleet.toml"
+    fleet.write_text("""ignore = ["*.mcap"]
+[[match]]
+glob = "wide*"
+run.terrain = "clay"
+[[match]]
+glob = "wild*"
+run.terrain = "mud"
+""")
+    words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season", "--json")
+    notes = json.loads(run_verb(*words, cwd=folder).stdout)["notes"]
+    assert notes == [f'{fleet}: [[match]] glob = "wild*" matched no log']
 
 
 def test_links_are_ignored_as_they_are_listed(folder: Path) -> None:
