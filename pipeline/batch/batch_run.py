@@ -10,13 +10,13 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from pipeline.batch import Request, Shard, Stop
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
-from pipeline.batch.recordings import Recordings, find_recordings
+from pipeline.batch.recordings import Recordings, Skipped, find_recordings
 from pipeline.core import SlipError, format_count
 from pipeline.report import list_noted, mark_batch, note_vehicles
 from pipeline.store import JSON, LAST_BATCH, Store
@@ -183,7 +183,11 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    planned, settled, notes = make_plan(listed, store, request)
+    try:
+        planned, settled, notes = make_plan(listed, store, request)
+    except SlipError as error:
+        _note_failure(store, began, error)
+        raise
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
     skipped = [each for each in listed.skipped if str(each.path) not in ignored]
     unseen: list[JSON] = [
@@ -218,25 +222,12 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         stopped = int(stop.code or 0)
     finally:
         if request.targets:
-            _note_batch(store, note | {"at": round(time.time(), 3), "stopped": bool(stopped)})
+            ended: dict[str, JSON] = {"at": round(time.time(), 3), "stopped": bool(stopped)}
+            _note_batch(store, note | ended | {"not_started": len(_list_waiting(todo, lines, ""))})
     # Only an error that affects every log, or a signal, leaves some.
     cause = STOPPED if stopped else next((line.reason for line in lines if line.code in STOPPING), "")
-    known = {line.path for line in lines}
-    waiting = [
-        Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
-        for one in todo
-        if one.log.path not in known
-    ]
-    why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
-    lines += [*waiting, *(Line(path=str(path), state="growing", reason=why) for path in listed.growing)]
-    absent = [
-        Line(path=str(each.path), state="left_out", reason=each.reason, hint=each.hint) for each in skipped
-    ]
-    # Whether a log is gone or was moved is known when all logs were worked on.
-    absent += [] if waiting else _find_gone(store, listed, request.shard)
-    lines += _mark_named(store, absent)
-    if not waiting:
-        _forget_named(store, absent, listed, request.shard)
+    lines += _list_waiting(todo, lines, cause)
+    lines += _list_absent(store, listed, skipped, request, is_whole=not cause)
     runs = {line.run for line in lines}
     notes += note_vehicles(one for one in store.survey().manifests if one.run in runs)
     return Outcome(
@@ -247,6 +238,32 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         notes=tuple(notes),
         stopped=stopped,
     )
+
+
+def _list_waiting(todo: Sequence[Task], lines: Sequence[Line], cause: str) -> list[Line]:
+    """Logs that were not started, because of an error that affects all or a signal."""
+    known = {line.path for line in lines}
+    return [
+        Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
+        for one in todo
+        if one.log.path not in known
+    ]
+
+
+def _list_absent(
+    store: Store, listed: Recordings, skipped: Sequence[Skipped], request: Request, *, is_whole: bool
+) -> list[Line]:
+    """Paths without a log to work on: still growing, left out, or gone."""
+    why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
+    absent = [
+        Line(path=str(each.path), state="left_out", reason=each.reason, hint=each.hint) for each in skipped
+    ]
+    # Whether a log is gone or was moved is known when all logs were worked on.
+    absent += _find_gone(store, listed, request.shard) if is_whole else []
+    lines = _mark_named(store, absent)
+    if is_whole:
+        _forget_named(store, absent, listed, request.shard)
+    return [*lines, *(Line(path=str(path), state="growing", reason=why) for path in listed.growing)]
 
 
 _NAMED = "batch/absent"
@@ -295,6 +312,16 @@ def _note_batch(store: Store, note: dict[str, JSON]) -> None:
     with suppress(SlipError):
         store.notes(folder).write(name, note)
         mark_batch(store)
+
+
+def _note_failure(store: Store, began: float, error: SlipError) -> None:
+    """Note that a batch failed before it came to its logs; which paths it left out stays as it was."""
+    folder, name = LAST_BATCH
+    unseen = (store.notes(folder).read(name) or {}).get("left_out")
+    _note_batch(
+        store,
+        {"began": began, "at": round(time.time(), 3), "failed": str(error), "left_out": cast("JSON", unseen)},
+    )
 
 
 def _work_through(

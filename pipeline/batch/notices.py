@@ -39,7 +39,9 @@ def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
     raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
     notes = Store(root).notes("batch/notified")
     sent = notes.read("sent") or {}
-    notes.write("sent", {about: text for about, text in raised.items() if about in sent})
+    # A batch that did not come to its logs knows nothing of them.
+    if outcome.lines and not waiting:
+        notes.write("sent", {about: text for about, text in raised.items() if about in sent})
     return {about: text for about, text in raised.items() if about not in sent}
 
 

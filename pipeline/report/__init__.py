@@ -438,8 +438,16 @@ def format_batch(store: Store) -> str:
         return ""
     if not ended:
         return f"The last batch began on {began} and did not end: it is still running, or it was killed."
-    how = "was stopped" if note.get("stopped") else "ended"
-    return f"The last batch began on {began} and {how} on {ended}."
+    how = "was stopped" if note.get("stopped") else "failed" if note.get("failed") else "ended"
+    why = shorten(" ".join(str(note.get("failed") or "").split()), LONGEST_TEXT)
+    why = why or (f"{format_count(waiting, 'log')} not started" if (waiting := read_waiting(note)) else "")
+    return f"The last batch began on {began} and {how} on {ended}{f': {why}' if why else ''}."
+
+
+def read_waiting(note: Mapping[str, object]) -> int:
+    """How many logs the last batch did not start, by its note."""
+    waiting = note.get("not_started")
+    return waiting if isinstance(waiting, int) else 0
 
 
 def _format_moment(seconds: object) -> str:

@@ -1,6 +1,7 @@
 """What a batch tells after its logs, once, to a command of the user."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -120,3 +121,21 @@ def test_what_is_left_out_again_is_said_as_before(field: Path) -> None:
     assert "left out" not in run_slip(*words)[1]
     (field / "dead.mcap").symlink_to("nothing")
     assert "left out, new" in run_slip(*words)[1]
+
+
+def test_a_night_with_a_broken_fleet_file_makes_nothing_new_again(field: Path) -> None:
+    """It is told itself, in the status and on the index as well."""
+    words = ("batch", "field", *INLINE, "--notify", TELL)
+    assert len(ask_verb(*words, code=1)["notified"]) == 2
+    fleet = field / "fleet.toml"
+    fleet.write_text("ignore = [\n")
+    (told,) = ask_verb(*words, code=1)["notified"]
+    assert "fleet.toml" in told
+    assert "fleet.toml" in ask_verb("results", "status")["failed_before_logs"]
+    assert re.search("last batch .*, failed: .*fleet.toml", run_slip("results", "status")[1])
+    assert re.search(
+        "The last batch began on .* and failed on .*fleet.toml", Path("results/index.html").read_text()
+    )
+    fleet.unlink()
+    assert ask_verb(*words, code=3)["notified"] == []
+    assert ask_verb("results", "status")["failed_before_logs"] is None
