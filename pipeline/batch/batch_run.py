@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, cast
 
+from pipeline.analysis.analyze import describe_replaced
 from pipeline.batch import Request, Shard, Stop
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
@@ -201,6 +202,7 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
     lines = [*map(_settle, settled)]
     waited: dict[str, str] = {}
+    earlier: dict[str, tuple[str, Path]] = {}
 
     def receive(report: Report) -> None:
         path = report.entry.log.path
@@ -210,7 +212,8 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
             waited[path] = report.holder
             return
         line = _make_line(report.entry, is_new=report.is_new)
-        lines.append(replace(line, waited_for=waited.get(path, ""), replaced=report.replaced))
+        lines.append(replace(line, waited_for=waited.get(path, "")))
+        earlier[path] = report.made, report.earlier
         watch.notify(lines[-1], report.entry.log.size)
 
     problems: tuple[SlipError, ...] = ()
@@ -224,6 +227,10 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         if request.targets:
             ended: dict[str, JSON] = {"at": round(time.time(), 3), "stopped": bool(stopped)}
             _note_batch(store, note | ended | {"not_started": len(_list_waiting(todo, lines, ""))})
+    # Pruning may have removed them by now.
+    lines = [
+        replace(line, replaced=describe_replaced(*earlier.get(line.path, ("", Path())))) for line in lines
+    ]
     # Only an error that affects every log, or a signal, leaves some.
     cause = STOPPED if stopped else next((line.reason for line in lines if line.code in STOPPING), "")
     lines += _list_waiting(todo, lines, cause)

@@ -172,13 +172,15 @@ class Report:
     Attributes:
         entry: new ledger entry of the log.
         is_new: whether a generation was published; false if nothing had changed.
-        replaced: what the earlier results that it replaced were made with, where that was something else.
+        made: what the earlier results that it replaced were made with, where that was something else.
+        earlier: folder of these.
         holder: who is working on the same run, so that nothing was done; empty where nobody is.
     """
 
     entry: Entry
     is_new: bool = False
-    replaced: str = ""
+    made: str = ""
+    earlier: Path = Path()
     holder: str = ""
 
 
@@ -205,12 +207,12 @@ def work_on(task: Task) -> Report:
     store = Store(task.options.out)
     started = time.monotonic()
     entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.run)
-    is_new, replaced = False, ""
+    is_new, made, earlier = False, "", Path()
     try:
         with store.claim(entry.run) as holder:
             if holder:
                 return Report(entry=entry, holder=holder)
-            entry, is_new, replaced = _analyze(task, entry)
+            entry, is_new, made, earlier = _analyze(task, entry)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         state, lasts = judge_error(error)
@@ -225,10 +227,10 @@ def work_on(task: Task) -> Report:
         peak_bytes=_peak_bytes(),
     )
     Ledger(store).write(entry)
-    return Report(entry=entry, is_new=is_new, replaced=replaced)
+    return Report(entry=entry, is_new=is_new, made=made, earlier=earlier)
 
 
-def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str]:
+def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str, Path]:
     before = Store(task.options.out).manifest(entry.run) if entry.run else None
     try:
         outcome = analyze_log(task.path, task.options)
@@ -246,7 +248,8 @@ def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str]:
         hint=f"List what the log holds: slip inspect {task.path}" if outcome.refusal else "",
         has_report=REPORT in outcome.manifest.files,
     )
-    return done, before is None or before.folder != outcome.manifest.folder, outcome.replaced
+    is_new = before is None or before.folder != outcome.manifest.folder
+    return done, is_new, outcome.made, outcome.earlier
 
 
 def _format_losses(outcome: Outcome) -> str:

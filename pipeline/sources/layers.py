@@ -279,9 +279,9 @@ def list_configuration_files(
     shown = _keep_links(listed or log)
     above = [*reversed(path.parents), *reversed(shown.parents), *([path] if folder == path else [])]
     fleets = [
-        _follow(place / FLEET_FILE)
-        for place in dict.fromkeys(above)
-        if _may_speak(place / FLEET_FILE, folder)
+        _follow(parent / FLEET_FILE)
+        for parent in dict.fromkeys(above)
+        if _may_speak(parent / FLEET_FILE, folder)
     ]
     # Of a file that is above both, its nearer place counts.
     fleets = list(dict.fromkeys(reversed(fleets)))[::-1]
