@@ -65,15 +65,22 @@ class Outcome:
         manifest: the current generation.
         computed: stages that were computed; empty when nothing had changed.
         twin: another log of the same content, whose run this one shares; empty if there is none.
-        replaced: what the earlier results of the run were made with, where that was something else, and where
-            they are kept; empty if no other answer was replaced.
+        made: what the earlier results of the run were made with, where that was something else; empty if no
+            other answer was replaced.
+        earlier: folder of the earlier results.
     """
 
     summary: Mapping[str, JSON]
     manifest: Manifest
     computed: tuple[str, ...]
     twin: str = ""
-    replaced: str = ""
+    made: str = ""
+    earlier: Path = Path()
+
+    @property
+    def replaced(self) -> str:
+        """What the earlier results were made with, and where they are kept; empty without others."""
+        return describe_replaced(self.made, self.earlier)
 
     @property
     def lossy(self) -> bool:
@@ -137,12 +144,21 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
             verdict = judge_run(generation.read_table("findings"), diagnosis)
             _write_outputs(work, log, options, progress, diagnosis, verdict)
         manifest = generation.commit({**_details(work, log, sha256), "verdict": verdict})
-    replaced = "" if previous is None else _describe_replaced(previous, manifest)
-    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin or "", replaced)
+    summary, computed = _read_summary(manifest, options), tuple(work.computed)
+    if previous is None:
+        return Outcome(summary, manifest, computed, twin or "")
+    made = _find_difference(previous, manifest)
+    return Outcome(summary, manifest, computed, twin or "", made, previous.folder)
 
 
-def _describe_replaced(before: Manifest, now: Manifest) -> str:
-    """What made the earlier results others than those that replace them, and where they are kept."""
+def describe_replaced(made: str, earlier: Path) -> str:
+    """What earlier results were made with, and where they are kept; empty where they were no others."""
+    where = f"they are kept in {spell_location(earlier)} until slip batch --prune --keep 0"
+    return made and f"{made}; {where if earlier.exists() else 'they were removed'}"
+
+
+def _find_difference(before: Manifest, now: Manifest) -> str:
+    """What made the earlier results others than those that replace them; empty if nothing did."""
     if before.part("log").get("sha256") != now.part("log").get("sha256"):
         # What else differs may follow from what the log holds.
         made = ["made of what the log held before it changed"]
@@ -152,8 +168,7 @@ def _describe_replaced(before: Manifest, now: Manifest) -> str:
     parts = {"diagnosis": DIAGNOSIS, "report": REPORT, "summary": SUMMARY}
     lost = [name for name, file in parts.items() if file in before.files and file not in now.files]
     made += [f"with a {enumerate_texts(lost)}, which the new ones lack"] if lost else []
-    where = spell_location(before.folder)
-    return f"{'; '.join(made)}; they are kept in {where} until slip batch --prune --keep 0" if made else ""
+    return "; ".join(made)
 
 
 def _list_choices(manifest: Manifest) -> dict[str, object]:

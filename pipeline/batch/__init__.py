@@ -83,6 +83,10 @@ class Request:
     retries_quarantined: bool = False
     pruning: Pruning | None = None
 
+    def find_limit(self, code: str) -> float:
+        """The limit that an error with this code says to be exceeded [s or bytes]; 0 for other errors."""
+        return {"timed_out": self.timeout_s, "out_of_memory": float(self.memory_bytes)}.get(code, 0.0)
+
 
 def parse_size(text: str) -> int:
     """Bytes from ``500MB``, ``2G``, ``1.5 TB`` (powers of ten).

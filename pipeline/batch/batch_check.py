@@ -6,9 +6,9 @@ from itertools import groupby
 
 from pipeline.batch.batch_plan import forget_pools, measure_results
 from pipeline.batch.batch_work import Entry, Ledger, see_nothing
-from pipeline.core import SlipError
+from pipeline.core import LONGEST_TEXT, SlipError, shorten
 from pipeline.logs import LogError, hash_log, locate_recorded
-from pipeline.report import count_logs, list_noted
+from pipeline.report import count_logs, list_noted, read_waiting
 from pipeline.store import (
     LAST_BATCH,
     MANIFEST,
@@ -237,6 +237,8 @@ class Status:
         began: when the last batch began, whether or not it worked on a log [s since 1970]; None without one.
         ended: when it ended; None if it is still running or was killed.
         stopped: whether a signal ended it.
+        not_started: logs that it did not start.
+        failed: why it failed before it came to the logs; empty if it did not.
         is_idle: whether it worked on no log.
     """
 
@@ -251,6 +253,8 @@ class Status:
     began: float | None
     ended: float | None
     stopped: bool
+    not_started: int
+    failed: str
     is_idle: bool
 
 
@@ -286,5 +290,7 @@ def read_status(store: Store) -> Status:
         began=began,
         ended=ended,
         stopped=bool(note.get("stopped")),
+        not_started=read_waiting(note),
+        failed=shorten(str(note.get("failed") or ""), LONGEST_TEXT),
         is_idle=began is not None and (last or 0.0) < began,
     )

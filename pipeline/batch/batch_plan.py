@@ -19,7 +19,7 @@ from pipeline.batch.recordings import Recordings
 from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
-from pipeline.sources import list_configuration_files, list_presets, match_ignored, read_tables
+from pipeline.sources import list_configuration_files, list_presets, match_globs, read_tables
 from pipeline.store import (
     LogIdentities,
     Manifest,
@@ -39,7 +39,7 @@ from schemas import contract_of, list_contracts
 # It covers more than the keys of the stages, so that it is available without opening the log. If it differs,
 # the keys decide what has to be computed.
 
-_WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")
+_WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "listed", "report", "figures", "force")
 """Options without influence on the tables, or whose content is hashed separately."""
 
 
@@ -57,10 +57,12 @@ class Fingerprinter:
         self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _fingerprint_program()])
         self._contents: dict[Path, str] = {}
 
-    def find_fingerprint(self, log: Path) -> str:
-        """That of one log."""
-        files = list_configuration_files(log, given=self._options.config, fleet=self._options.fleet)
-        return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files]])
+    def find_fingerprint(self, log: Path, listed: Path | None = None) -> str:
+        """That of one log; ``listed`` is its path by the links that lead to it, if there are any."""
+        given, fleet = self._options.config, self._options.fleet
+        files = list_configuration_files(log, given=given, fleet=fleet, listed=listed)
+        names = [] if listed is None else [str(listed)]
+        return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files], *names])
 
     def _hash_content(self, file: Path) -> str:
         known = self._contents.get(file)
@@ -179,25 +181,26 @@ def make_plan(
     odd = [each.path for each in listed.skipped if each.is_entry]
     fleet = request.options.fleet
     matches = {
-        path: match_ignored(listed.name_listed(path), fleet)
+        path: match_globs(listed.name_listed(path), fleet)
         for path in (*listed.recordings, *listed.growing, *odd)
     }
     ignored = {
         path: _format_rule(*rules[0])
         for path, matching in matches.items()
-        if path not in listed.growing and (rules := [rule for rule, fits in matching.items() if fits])
+        if path not in listed.growing
+        and (rules := [rule for rule, fits in matching.items() if fits and rule[1] == "ignore"])
     }
     used = {rule for matching in matches.values() for rule, fits in matching.items() if fits}
     # Of the logs of a folder that was not asked for, only some are known.
     unused = [
-        f"{_format_rule(file, glob)} matched no log"
-        for file, glob in dict.fromkeys(rule for matching in matches.values() for rule in matching)
-        if (file, glob) not in used and (file == fleet or listed.covers(file.parent))
+        f"{_format_rule(*rule)} matched no log"
+        for rule in dict.fromkeys(rule for matching in matches.values() for rule in matching)
+        if rule not in used and (rule[0] == fleet or listed.covers(rule[0].parent))
     ]
     settled = [_ignore(path, why, ledger, store) for path, why in ignored.items()]
     paths = [path for path in listed.recordings if path not in ignored]
     hasher = Fingerprinter(request.options)
-    tasks = [_look_at(path, hasher, ledger, request.options) for path in paths]
+    tasks = [_look_at(path, listed.name_listed(path), hasher, ledger, request.options) for path in paths]
     owners = _find_owners(tasks, manifests)
     settled += [
         task.before for task in tasks if task.before and _is_settled(task, manifests, owners, request)
@@ -219,8 +222,8 @@ def make_plan(
     return sorted(todo, key=lambda task: (-task.log.size, task.path)), settled, unused
 
 
-def _format_rule(file: Path, glob: str) -> str:
-    return f'{file}: ignore = "{glob}"'
+def _format_rule(file: Path, kind: str, glob: str) -> str:
+    return f'{file}: {"ignore" if kind == "ignore" else "[[match]] glob"} = "{glob}"'
 
 
 def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> Entry:
@@ -240,12 +243,15 @@ def _ignore(path: Path, why: str, ledger: Mapping[str, Entry], store: Store) -> 
     return entry
 
 
-def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options) -> Task:
+def _look_at(
+    path: Path, shown: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry], options: Options
+) -> Task:
     # Unreadable logs are processed all the same: this reports what is wrong with them.
     log, fingerprint = see_nothing(str(path)), ""
+    options = replace(options, listed=None if shown == path else shown)
     with suppress(OSError, SlipError):
         log = see_log(path)
-        fingerprint = hasher.find_fingerprint(path)
+        fingerprint = hasher.find_fingerprint(path, options.listed)
     before = ledger.get(log.path)
     return Task(path=path, log=log, fingerprint=fingerprint, options=options, before=before)
 
@@ -265,13 +271,15 @@ def _is_settled(
 ) -> bool:
     """Whether there is nothing to do for a log that a batch has seen before."""
     entry = task.before
-    if entry is None or not entry.fits(task.log, task.fingerprint) or request.options.force:
+    manifest = None if entry is None else manifests.get(entry.run)
+    is_asked_for = request.options.force or (manifest is not None and manifest.again)
+    if entry is None or not entry.fits(task.log, task.fingerprint) or is_asked_for:
         return False
-    manifest = manifests.get(entry.run)
-    if manifest is not None and manifest.again:
-        return False
-    if entry.lasts or entry.state == "quarantined":
-        return entry.lasts or not request.retries_quarantined
+    if entry.state == "quarantined":
+        # With more time or memory than it has exceeded it may come to an end.
+        return not request.retries_quarantined and request.find_limit(entry.code) <= entry.limit
+    if entry.lasts:
+        return True
     if entry.state == "copy":
         original = manifests.get(entry.reason)
         log = {} if original is None else original.part("log")
@@ -341,7 +349,7 @@ _NOTE = "all runs"
 POOLED = ("datasets.parquet", "index.html")
 """Files over all runs."""
 _MOST_ROUNDS = 20
-_VERSION = 3
+_VERSION = 4
 """Version of the pooled files; increase it when their generation changes."""
 
 

@@ -9,15 +9,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, cast
 
+from pipeline.analysis.analyze import describe_replaced
 from pipeline.batch import Request, Shard, Stop
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Limits, find_blame, open_executor
-from pipeline.batch.recordings import find_recordings
+from pipeline.batch.recordings import Recordings, Skipped, find_recordings
 from pipeline.core import SlipError, format_count
-from pipeline.report import mark_batch
+from pipeline.report import list_noted, mark_batch, note_vehicles
 from pipeline.store import JSON, LAST_BATCH, Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
@@ -28,6 +30,12 @@ STOPPED = "the batch was stopped"
 FAILED_STATES = ("failed", "quarantined", "not_started")
 """States of logs that should have results and have none."""
 
+_RETRY = "It is skipped until it changes; --retry-quarantined tries it again"
+_RETRIES = {
+    "timed_out": "It is skipped until it changes or --timeout is longer; --retry-quarantined tries it again",
+    "out_of_memory": "It is skipped until it changes or has more memory (--memory, or fewer --jobs); "
+    "--retry-quarantined tries it again",
+}
 _BUSY_PAUSE_S = 0.25
 _FATAL_KILLS = 2
 """Number of killed workers after which a log is quarantined until it, or its fingerprint, changes."""
@@ -55,7 +63,8 @@ class Line:
         run: name of its run.
         state: the one of `STATES` under which it is counted and listed: what its results are, new or not. A
             log without losses is ``unchanged`` where there was nothing to do; ``left_out`` is a path that
-            cannot be read, for example a folder without permission or a pipe.
+            cannot be read, for example a folder without permission or a pipe, and ``gone`` a log with
+            results that is not there any more.
         code: code of the error.
         reason: why it failed or cannot show slip, or what was lost.
         hint: what to do.
@@ -142,8 +151,12 @@ class Outcome:
 
     @property
     def has_losses(self) -> bool:
-        """Whether a log had losses, cannot show slip, failed and is unchanged, or could not be read."""
-        return any(line.state in {"lossy", "refused", "left_out", *FAILED_STATES} for line in self.lines)
+        """Whether a log had losses, cannot show slip, failed before, could not be read, or is newly gone."""
+        # The results of a log that is gone are whole: once is enough.
+        lasting = {"lossy", "refused", "left_out", *FAILED_STATES}
+        return any(
+            line.state in lasting or (line.state == "gone" and not line.unchanged) for line in self.lines
+        )
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
@@ -171,10 +184,16 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     store = Store(request.options.out)
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    planned, settled, notes = make_plan(listed, store, request)
+    try:
+        planned, settled, notes = make_plan(listed, store, request)
+    except SlipError as error:
+        _note_failure(store, began, error)
+        raise
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
     skipped = [each for each in listed.skipped if str(each.path) not in ignored]
-    unseen: list[JSON] = [{"path": str(each.path), "reason": each.reason} for each in skipped]
+    unseen: list[JSON] = [
+        {"path": str(each.path), "reason": each.reason, "hint": each.hint} for each in skipped
+    ]
     note: dict[str, JSON] = {"began": began, "at": None, "left_out": unseen}
     if request.targets:
         _note_batch(store, note)
@@ -183,6 +202,7 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
     lines = [*map(_settle, settled)]
     waited: dict[str, str] = {}
+    earlier: dict[str, tuple[str, Path]] = {}
 
     def receive(report: Report) -> None:
         path = report.entry.log.path
@@ -192,7 +212,8 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
             waited[path] = report.holder
             return
         line = _make_line(report.entry, is_new=report.is_new)
-        lines.append(replace(line, waited_for=waited.get(path, ""), replaced=report.replaced))
+        lines.append(replace(line, waited_for=waited.get(path, "")))
+        earlier[path] = report.made, report.earlier
         watch.notify(lines[-1], report.entry.log.size)
 
     problems: tuple[SlipError, ...] = ()
@@ -204,18 +225,18 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
         stopped = int(stop.code or 0)
     finally:
         if request.targets:
-            _note_batch(store, note | {"at": round(time.time(), 3), "stopped": bool(stopped)})
+            ended: dict[str, JSON] = {"at": round(time.time(), 3), "stopped": bool(stopped)}
+            _note_batch(store, note | ended | {"not_started": len(_list_waiting(todo, lines, ""))})
+    # Pruning may have removed them by now.
+    lines = [
+        replace(line, replaced=describe_replaced(*earlier.get(line.path, ("", Path())))) for line in lines
+    ]
     # Only an error that affects every log, or a signal, leaves some.
     cause = STOPPED if stopped else next((line.reason for line in lines if line.code in STOPPING), "")
-    known = {line.path for line in lines}
-    lines += [
-        Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
-        for one in todo
-        if one.log.path not in known
-    ]
-    why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
-    lines += [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
-    lines += [Line(path=str(each.path), state="left_out", reason=each.reason) for each in skipped]
+    lines += _list_waiting(todo, lines, cause)
+    lines += _list_absent(store, listed, skipped, request, is_whole=not cause)
+    runs = {line.run for line in lines}
+    notes += note_vehicles(one for one in store.survey().manifests if one.run in runs)
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -226,12 +247,88 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     )
 
 
+def _list_waiting(todo: Sequence[Task], lines: Sequence[Line], cause: str) -> list[Line]:
+    """Logs that were not started, because of an error that affects all or a signal."""
+    known = {line.path for line in lines}
+    return [
+        Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
+        for one in todo
+        if one.log.path not in known
+    ]
+
+
+def _list_absent(
+    store: Store, listed: Recordings, skipped: Sequence[Skipped], request: Request, *, is_whole: bool
+) -> list[Line]:
+    """Paths without a log to work on: still growing, left out, or gone."""
+    why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
+    absent = [
+        Line(path=str(each.path), state="left_out", reason=each.reason, hint=each.hint) for each in skipped
+    ]
+    # Whether a log is gone or was moved is known when all logs were worked on.
+    absent += _find_gone(store, listed, request.shard) if is_whole else []
+    lines = _mark_named(store, absent)
+    if is_whole:
+        _forget_named(store, absent, listed, request.shard)
+    return [*lines, *(Line(path=str(path), state="growing", reason=why) for path in listed.growing)]
+
+
+_NAMED = "batch/absent"
+"""Folder of the notes on paths without a log that a batch has named."""
+
+
+def _find_gone(store: Store, listed: Recordings, shard: Shard | None) -> list[Line]:
+    """Logs with results that this batch would have found if they were still there."""
+    runs = {path: entry.run for path, entry in Ledger(store).read_all().items()}
+    return [
+        Line(path=one["path"], run=runs[one["path"]], state="gone", reason=one["reason"])
+        for one in list_noted(store)
+        if one["state"] == "gone"
+        and listed.would_list(Path(one["path"]))
+        and _is_own(runs[one["path"]], shard)
+    ]
+
+
+def _mark_named(store: Store, absent: Sequence[Line]) -> list[Line]:
+    """Lines of paths without a log: unchanged where an earlier batch has said the same; remembered."""
+    notes = store.notes(_NAMED)
+    marked: list[Line] = []
+    for line in absent:
+        note = {"path": line.path, "run": line.run, "reason": line.reason}
+        is_old = notes.read(line.path) == note
+        if not is_old:
+            with suppress(SlipError):
+                notes.write(line.path, note)
+        marked.append(replace(line, unchanged=is_old))
+    return marked
+
+
+def _forget_named(store: Store, absent: Sequence[Line], listed: Recordings, shard: Shard | None) -> None:
+    """Forget which paths had no log where that is over."""
+    notes = store.notes(_NAMED)
+    now = {line.path for line in absent}
+    for note in list(notes.read_all()):
+        path = str(note.get("path"))
+        if path not in now and listed.would_list(Path(path)) and _is_own(str(note.get("run")), shard):
+            notes.remove(path)
+
+
 def _note_batch(store: Store, note: dict[str, JSON]) -> None:
     """Note that a batch began or ended, also where all logs are unchanged; a full disk is told elsewhere."""
     folder, name = LAST_BATCH
     with suppress(SlipError):
         store.notes(folder).write(name, note)
         mark_batch(store)
+
+
+def _note_failure(store: Store, began: float, error: SlipError) -> None:
+    """Note that a batch failed before it came to its logs; which paths it left out stays as it was."""
+    folder, name = LAST_BATCH
+    unseen = (store.notes(folder).read(name) or {}).get("left_out")
+    _note_batch(
+        store,
+        {"began": began, "at": round(time.time(), 3), "failed": str(error), "left_out": cast("JSON", unseen)},
+    )
 
 
 def _work_through(
@@ -259,7 +356,8 @@ def _work_through(
                 try:
                     report = future.result()
                 except (Exception, CancelledError) as error:  # noqa: BLE001 - whatever a worker can die of
-                    report = Report(entry=_judge(task, *find_blame(task, error), ledger))
+                    code, reason = find_blame(task, error)
+                    report = Report(entry=_judge(task, code, reason, request.find_limit(code), ledger))
                     if report.entry.kills == 1:
                         (suspects if executor.spreads_blame else queue).append(task)
                         continue
@@ -274,8 +372,11 @@ def _work_through(
         executor.close()
 
 
-def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
-    """Entry of a log whose worker was lost: failed at first, then quarantined until it changes."""
+def _judge(task: Task, code: str, reason: str, limit: float, ledger: Ledger) -> Entry:
+    """Entry of a log whose worker was lost: failed at first, then quarantined until it changes.
+
+    One that exceeded a limit also leaves the quarantine when that limit is raised.
+    """
     before = ledger.read(task.log.path)
     is_known = before is not None and before.state == "failed" and before.fits(task.log, task.fingerprint)
     kills = 0 if code in STOPPING else 1 + (before.kills if before is not None and is_known else 0)
@@ -287,10 +388,9 @@ def _judge(task: Task, code: str, reason: str, ledger: Ledger) -> Entry:
         run=task.run,
         code=code,
         reason=f"{reason}; {kills} times" if quarantined else reason,
-        hint="It is skipped until it changes; --retry-quarantined tries it again"
-        if quarantined
-        else "Run the same command again",
+        hint=_RETRIES.get(code, _RETRY) if quarantined else "Run the same command again",
         kills=kills,
+        limit=limit,
     )
     ledger.write(entry)
     return entry
@@ -312,12 +412,16 @@ def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int
 
 
 def _select(todo: Sequence[Task], shard: Shard | None) -> list[Task]:
-    """Logs of this machine: selected by the run's name, so that machines need no communication."""
+    """Logs of this machine."""
+    return [task for task in todo if _is_own(task.run, shard)]
+
+
+def _is_own(run: str, shard: Shard | None) -> bool:
+    """Whether a run is this machine's: by its name, so that machines need no communication."""
     if shard is None:
-        return list(todo)
-    digests = [hashlib.sha256(task.run.encode()).digest() for task in todo]
-    numbers = [int.from_bytes(digest[:8], "big") % shard.count + 1 for digest in digests]
-    return [task for task, number in zip(todo, numbers, strict=True) if number == shard.number]
+        return True
+    digest = hashlib.sha256(run.encode()).digest()
+    return int.from_bytes(digest[:8], "big") % shard.count + 1 == shard.number
 
 
 def _settle(entry: Entry) -> Line:

@@ -24,7 +24,7 @@ from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Sto
 # A ledger entry counts only if the results confirm it: a log is done only while the results contain the
 # generation named in its entry. A lost entry costs one reading of the log.
 
-STATES = ("done", "unchanged", *LOG_STATES[1:-1], "growing", "not_started")
+STATES = ("done", "unchanged", *LOG_STATES[1:], "growing", "not_started")
 """What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
@@ -69,6 +69,7 @@ class Entry:
         hint: what to do about it.
         lasts: whether an error stays until the log or its fingerprint changes (`judge_error`).
         kills: number of workers it has killed in this state.
+        limit: of a log that exceeded its time [s] or memory [bytes], that limit.
         has_report: whether the generation contains a report.
         seconds: processing time.
         peak_bytes: peak memory of its worker.
@@ -85,6 +86,7 @@ class Entry:
     hint: str = ""
     lasts: bool = False
     kills: int = 0
+    limit: float = 0.0
     has_report: bool = False
     seconds: float = 0.0
     peak_bytes: int = 0
@@ -170,13 +172,15 @@ class Report:
     Attributes:
         entry: new ledger entry of the log.
         is_new: whether a generation was published; false if nothing had changed.
-        replaced: what the earlier results that it replaced were made with, where that was something else.
+        made: what the earlier results that it replaced were made with, where that was something else.
+        earlier: folder of these.
         holder: who is working on the same run, so that nothing was done; empty where nobody is.
     """
 
     entry: Entry
     is_new: bool = False
-    replaced: str = ""
+    made: str = ""
+    earlier: Path = Path()
     holder: str = ""
 
 
@@ -203,12 +207,12 @@ def work_on(task: Task) -> Report:
     store = Store(task.options.out)
     started = time.monotonic()
     entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.run)
-    is_new, replaced = False, ""
+    is_new, made, earlier = False, "", Path()
     try:
         with store.claim(entry.run) as holder:
             if holder:
                 return Report(entry=entry, holder=holder)
-            entry, is_new, replaced = _analyze(task, entry)
+            entry, is_new, made, earlier = _analyze(task, entry)
     except SlipError as error:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         state, lasts = judge_error(error)
@@ -223,10 +227,10 @@ def work_on(task: Task) -> Report:
         peak_bytes=_peak_bytes(),
     )
     Ledger(store).write(entry)
-    return Report(entry=entry, is_new=is_new, replaced=replaced)
+    return Report(entry=entry, is_new=is_new, made=made, earlier=earlier)
 
 
-def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str]:
+def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str, Path]:
     before = Store(task.options.out).manifest(entry.run) if entry.run else None
     try:
         outcome = analyze_log(task.path, task.options)
@@ -244,7 +248,8 @@ def _analyze(task: Task, entry: Entry) -> tuple[Entry, bool, str]:
         hint=f"List what the log holds: slip inspect {task.path}" if outcome.refusal else "",
         has_report=REPORT in outcome.manifest.files,
     )
-    return done, before is None or before.folder != outcome.manifest.folder, outcome.replaced
+    is_new = before is None or before.folder != outcome.manifest.folder
+    return done, is_new, outcome.made, outcome.earlier
 
 
 def _format_losses(outcome: Outcome) -> str:

@@ -12,13 +12,14 @@ from pipeline.store import Store
 
 _NOTIFY_S = 120.0
 """Time that the command of the user may take [s]: mail servers that do not answer give up after a minute."""
-_NEWS = {"lossy", "refused", "failed", "quarantined", "left_out"}
+_NEWS = {"lossy", "refused", "failed", "quarantined", "left_out", "gone"}
 
 
 def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
     """Texts of what was not reported yet, by what they are about.
 
-    These are logs without results or with losses, logs that cannot show slip, and problems of the batch.
+    These are logs without results or with losses, logs that cannot show slip or are gone, and problems of
+    the batch.
 
     Args:
         root: the results, which keep what was reported.
@@ -38,7 +39,9 @@ def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
     raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
     notes = Store(root).notes("batch/notified")
     sent = notes.read("sent") or {}
-    notes.write("sent", {about: text for about, text in raised.items() if about in sent})
+    # A batch that did not come to its logs knows nothing of them.
+    if outcome.lines and not waiting:
+        notes.write("sent", {about: text for about, text in raised.items() if about in sent})
     return {about: text for about, text in raised.items() if about not in sent}
 
 

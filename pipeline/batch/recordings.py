@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from pipeline.batch import BatchError
 from pipeline.core import ask_within, describe_silence, walk_tree
-from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
+from pipeline.logs import SUFFIXES, RemotePath, is_finished, judge_content, list_files
 from pipeline.logs.index import LISTING, are_separate, split_number
 
 # Reading of arbitrary folders: link cycles, dead mounts, folders without permission.
@@ -22,21 +22,27 @@ from pipeline.logs.index import LISTING, are_separate, split_number
 # Whatever cannot be read is reported and skipped; everything else is still found.
 
 _MAGIC = frozenset("*?[")
+_LIKE_SUFFIX = re.compile(r"\.(mcap|db3|bag)(?![a-z0-9])", re.IGNORECASE)
+"""In names of recordings, also of rotated, renamed and packed ones: ``run.mcap.1``, ``RUN.MCAP``."""
 
 Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """Skipped path, and the reason."""
+    """Skipped path.
+
+    Attributes:
+        path: file, folder or other entry.
+        reason: why.
+        hint: what to do.
+        is_entry: whether its folder was read, and what it is is known: nothing waits for an answer.
+    """
 
     path: Path
     reason: str
-
-    @property
-    def is_entry(self) -> bool:
-        """Whether its folder was read, and it is no file: nothing waits for an answer."""
-        return self.reason in {NO_FILE, *_DEAD}
+    hint: str = ""
+    is_entry: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,12 +70,14 @@ class Looker:
         patience_s: time limit of one access [s].
         skipped: paths that could not be read.
         tops: folders that were asked for; links resolved.
+        globs: globs that were asked for, absolute.
         links: the link by which each path outside of them was found.
     """
 
     patience_s: float
     skipped: list[Skipped] = field(default_factory=list)
     tops: list[Path] = field(default_factory=list)
+    globs: list[str] = field(default_factory=list)
     links: dict[Path, Path] = field(default_factory=dict)
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
@@ -85,6 +93,19 @@ class Looker:
     def skip(self, path: Path, reason: str) -> None:
         """Record a path as skipped."""
         self.skipped.append(Skipped(path, reason))
+
+    def leave(self, path: Path, reason: str, hint: str = "") -> None:
+        """Record an entry of a folder as skipped, of which is known what it is."""
+        self.skipped.append(Skipped(path, reason, hint, is_entry=True))
+
+    def is_recording(self, path: Path) -> bool:
+        """Whether a file is to be read, by its name, or by its content where something follows the suffix."""
+        if path.name.endswith(SUFFIXES) or not _LIKE_SUFFIX.search(path.name):
+            return path.name.endswith(SUFFIXES)
+        content = self.ask(path, lambda: judge_content(path))
+        if content is not None and content.packed is not None:
+            self.leave(path, *content.packed)
+        return content is not None and content.is_read
 
     def walk(self, top: Path) -> Iterator[Folder]:
         """Every folder at and below a path, each once, also with cyclic links."""
@@ -149,7 +170,7 @@ class Looker:
                     self.links.setdefault(leads_to, path)
             # A link that leads nowhere, of another suffix, was one to neither a log nor a folder.
             elif entry.name.endswith(SUFFIXES) or (kind in _DEAD and not path.suffix):
-                self.skip(path, kind)
+                self.leave(path, kind)
         return Folder(folder, kinds["folder"], kinds["file"], identity)
 
 
@@ -203,6 +224,7 @@ class Recordings:
         skipped: skipped paths with reasons: folders that cannot be read, pipes, broken links.
         links: the link by which each path outside of the folders was found.
         tops: the folders that were searched.
+        globs: the globs that were expanded, absolute.
     """
 
     recordings: tuple[Path, ...]
@@ -210,10 +232,18 @@ class Recordings:
     skipped: tuple[Skipped, ...] = field(default=())
     links: Mapping[Path, Path] = field(default_factory=dict, compare=False)
     tops: tuple[Path, ...] = field(default=(), compare=False)
+    globs: tuple[str, ...] = field(default=(), compare=False)
 
     def covers(self, folder: Path) -> bool:
         """Whether all recordings in a folder and below it were looked for."""
         return any(folder.resolve().is_relative_to(top) for top in self.tops)
+
+    def would_list(self, path: Path) -> bool:
+        """Whether a recording would have been found if it were there."""
+        names = (path, self.name_listed(path))
+        return any(name.is_relative_to(top) for name in names for top in self.tops) or any(
+            fnmatch.fnmatchcase(str(name), glob) for name in names for glob in self.globs
+        )
 
     def name_listed(self, path: Path) -> Path:
         """The path of a recording as its folder lists it: by the links that lead to it."""
@@ -254,6 +284,7 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         tuple(skipped[path] for path in sorted(skipped)),
         looker.links,
         tuple(looker.tops),
+        tuple(looker.globs),
     )
 
 
@@ -310,7 +341,7 @@ def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
 
 def _find_in(target: str, looker: Looker) -> Iterator[Path]:
     if "://" in target:
-        yield from _find_remote(RemotePath(target))
+        yield from _find_remote(RemotePath(target), looker)
         return
     path = Path(target).expanduser()
     before = len(looker.skipped)
@@ -322,10 +353,11 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
         for folder in looker.walk(real):
             yield from _list_recordings(folder, looker)
     elif _GLOB.search(target):
+        looker.globs.append(str(path.absolute()))
         for match in looker.expand(path):
             yield from _find_match(match, looker)
     elif real is not None and looker.ask(real, real.exists):
-        looker.skip(real, NO_FILE)
+        looker.leave(real, NO_FILE)
     elif len(looker.skipped) == before:
         hint = "Check the path; quote a glob so that the shell does not expand it"
         raise BatchError("logs_not_found", "there is no such file or folder", where=target, hint=hint)
@@ -336,7 +368,7 @@ def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
     if looker.ask(match, match.is_dir):
         for folder in looker.walk(match):
             yield from _list_recordings(folder, looker)
-    elif match.name.endswith(SUFFIXES) and looker.ask(match, match.is_file):
+    elif looker.ask(match, match.is_file) and looker.is_recording(match):
         yield looker.ask(match, lambda: _parent_recording(match) or match) or match
 
 
@@ -349,7 +381,9 @@ def _list_recordings(folder: Folder, looker: Looker) -> Iterator[Path]:
         parts = set() if looker.ask(folder.path, partial(are_separate, files)) else parts
     if parts:
         yield folder.path
-    yield from (folder.files[name] for name in logs if name not in parts)
+    for name, file in folder.files.items():
+        if name not in parts and (name in logs or looker.is_recording(file)):
+            yield file
 
 
 def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[str]:
@@ -357,18 +391,18 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
 
     Args:
         folder: the folder.
-        names: names of the logs in it.
+        names: names of files in it; one that is no plain name of a recording is no part.
         is_listed: whether a ``metadata.yaml`` marks the folder as a recording.
     """
     # A ROS 1 bag is always a recording of its own.
-    parts = [name for name in names if not name.endswith(".bag")]
+    parts = [name for name in names if name.endswith(SUFFIXES) and not name.endswith(".bag")]
     if is_listed:
         return parts
     pattern = re.compile(re.escape(folder.name) + r"_\d+\.[\w.]+")
     return [name for name in parts if pattern.fullmatch(name)]
 
 
-def _find_remote(target: RemotePath) -> Iterator[Path]:
+def _find_remote(target: RemotePath, looker: Looker) -> Iterator[Path]:
     """Recordings under a prefix, or the one at an address; objects are always complete."""
     target.refresh()
     base, _, pattern = str(target).partition("*")
@@ -385,7 +419,7 @@ def _find_remote(target: RemotePath) -> Iterator[Path]:
         objects = [one for one in objects if fnmatch.fnmatchcase(str(one), str(target))]
     listed = {one.parent for one in objects if one.name == LISTING}
     for one in objects:
-        if one.name.endswith(SUFFIXES):
+        if looker.is_recording(one):
             folder = one.parent
             is_part = bool(list_parts(folder, [one.name], is_listed=folder in listed))
             yield folder if is_part else one

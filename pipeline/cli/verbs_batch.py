@@ -78,7 +78,8 @@ def batch(  # noqa: D417 - the shared choices document themselves
     """Analyze the new and changed logs of a folder.
 
     The same command again continues. Exit codes: 0 all done; 1 a log or a step failed; 3 done, but a log had
-    losses, cannot show slip, could not be looked at, or failed before and is unchanged; 130 or 143 stopped.
+    losses, cannot show slip, could not be looked at, failed before and is unchanged, or is gone since the
+    batch before; 130 or 143 stopped.
 
     Args:
         jobs: logs processed in parallel (default: the cores it may use).
@@ -94,7 +95,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
         keep: old generations to keep of each run.
         quota: with --prune, size of the results above which the oldest go first, for example 200GB.
         notify: command line for the shell that gets the JSON object on its standard input when something is
-            new: a log that failed, had losses or cannot show slip, or another error.
+            new: a log that failed, had losses, cannot show slip or is gone, or another error.
         everything: name every log, also of many with the same reason.
         json: print one JSON object.
         quiet: print nothing but errors, each reason once.

@@ -182,6 +182,8 @@ def _as_json(status_now: Status) -> dict[str, object]:
         "began": status_now.began,
         "ended": status_now.ended,
         "stopped": status_now.stopped,
+        "not_started": status_now.not_started,
+        "failed_before_logs": status_now.failed or None,
         "writing": [{"run": run, "holder": holder} for run, holder in status_now.writers.items()],
         "logs": [
             {"path": entry.log.path, **{k: v for k, v in asdict(entry).items() if k != "log"}}
@@ -199,9 +201,13 @@ def _format_status(status_now: Status, *, everything: bool) -> list[str]:
     last = _format_time(status_now.ended)
     if status_now.stopped:
         last += ", stopped"
+    if status_now.not_started:
+        last += f", {format_count(status_now.not_started, 'log')} not started"
     if status_now.began is not None and status_now.ended is None:
         began = _format_time(status_now.began)
         last = f"began {began} and did not end: it is still running, or it was killed"
+    elif status_now.failed:
+        last += f", failed: {status_now.failed}"
     elif status_now.is_idle:
         last += f" (the last that worked on a log: {_format_time(status_now.last)})"
     old = format_count(status_now.old_generations, "old generation")

@@ -42,7 +42,7 @@ from pipeline.logs.index import (
     stem_of,
     take_start,
 )
-from pipeline.logs.part import is_finished
+from pipeline.logs.part import is_finished, judge_content
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics
 from pipeline.logs.records import LATEST_NS, OTHER_VERSION, ROS1_BAG, SQLITE_BAG, LogError, Loss
 from pipeline.logs.remote import RemotePath, locate_recorded, open_store, spell_location, to_location

@@ -1,14 +1,13 @@
 """What a file is that is no recording, by its first bytes, and the one thing to do about it."""
 
 import re
+from collections.abc import Iterable
 from typing import Final
 
 LONGEST_START: Final = 1 << 12
 """Number of bytes at the start of a file by which it is named."""
 
 _UNPACK: Final = "Unpack it, and give the recording that is in it"
-_TAR_AT: Final = 257
-"""Offset of the magic of a tar archive."""
 
 _ULOG: Final = (
     "Convert it to a ROS bag with pyulog (`ulog2rosbag run.ulg run.bag px4_msgs`), or record the topics of "
@@ -17,6 +16,23 @@ _ULOG: Final = (
 _BY_TABLE: Final = (
     "Write its columns into an .mcap with the times of their rows, as examples/tables_to_mcap.py does"
 )
+
+_PACKED: Final = (
+    (rb"PK(?:\x03\x04|\x05\x06)", "it is a zip archive", f"{_UNPACK}: unzip FILE"),
+    (rb"\x1f\x8b", "it is compressed with gzip", f"{_UNPACK}: gunzip FILE, or tar -xzf FILE"),
+    (rb"BZh[1-9]", "it is compressed with bzip2", f"{_UNPACK}: bunzip2 FILE, or tar -xjf FILE"),
+    (rb"\xfd7zXZ\0", "it is compressed with xz", f"{_UNPACK}: unxz FILE, or tar -xJf FILE"),
+    (rb"7z\xbc\xaf\x27\x1c", "it is a 7-Zip archive", f"{_UNPACK}: 7z x FILE"),
+    (rb"Rar!\x1a\x07", "it is a RAR archive", f"{_UNPACK}: unrar x FILE"),
+    (rb"\x04\x22\x4d\x18", "it is compressed with LZ4 as a whole", f"{_UNPACK}: lz4 -d FILE"),
+    (
+        rb"\x28\xb5\x2f\xfd",
+        "it is compressed with Zstandard as a whole, which its name does not say",
+        "Add .zstd to its name (run.mcap.zstd), or unpack it: zstd -d FILE",
+    ),
+    (rb".{257}ustar", "it is a tar archive", f"{_UNPACK}: tar -xf FILE"),
+)
+"""As `_KINDS`, of what may hold a recording."""
 
 _KINDS: Final = (
     (
@@ -35,18 +51,6 @@ _KINDS: Final = (
         rb"\xa3\x95\x80\x80",
         "it is a log of ArduPilot's flight controller (DataFlash), which is not read",
         _BY_TABLE,
-    ),
-    (rb"PK(?:\x03\x04|\x05\x06)", "it is a zip archive", f"{_UNPACK}: unzip FILE"),
-    (rb"\x1f\x8b", "it is compressed with gzip", f"{_UNPACK}: gunzip FILE, or tar -xzf FILE"),
-    (rb"BZh[1-9]", "it is compressed with bzip2", f"{_UNPACK}: bunzip2 FILE, or tar -xjf FILE"),
-    (rb"\xfd7zXZ\0", "it is compressed with xz", f"{_UNPACK}: unxz FILE, or tar -xJf FILE"),
-    (rb"7z\xbc\xaf\x27\x1c", "it is a 7-Zip archive", f"{_UNPACK}: 7z x FILE"),
-    (rb"Rar!\x1a\x07", "it is a RAR archive", f"{_UNPACK}: unrar x FILE"),
-    (rb"\x04\x22\x4d\x18", "it is compressed with LZ4 as a whole", f"{_UNPACK}: lz4 -d FILE"),
-    (
-        rb"\x28\xb5\x2f\xfd",
-        "it is compressed with Zstandard as a whole, which its name does not say",
-        "Add .zstd to its name (run.mcap.zstd), or unpack it: zstd -d FILE",
     ),
     (
         rb"rosbag2_bagfile_information\s*:",
@@ -93,12 +97,23 @@ def name_foreign(start: bytes) -> tuple[str, str] | None:
     Args:
         start: its first `LONGEST_START` bytes.
     """
-    for pattern, what, hint in _KINDS:
+    return _match_kind(start, (*_KINDS, *_PACKED)) or _name_text(start)
+
+
+def name_packed(start: bytes) -> tuple[str, str] | None:
+    """What a file that may hold a recording is packed with, and how to unpack it; None of other files.
+
+    Args:
+        start: its first `LONGEST_START` bytes.
+    """
+    return _match_kind(start, _PACKED)
+
+
+def _match_kind(start: bytes, kinds: Iterable[tuple[bytes, str, str]]) -> tuple[str, str] | None:
+    for pattern, what, hint in kinds:
         if re.match(pattern, start, re.DOTALL | re.IGNORECASE):
             return what, hint
-    if start[_TAR_AT:].startswith(b"ustar"):
-        return "it is a tar archive", f"{_UNPACK}: tar -xf FILE"
-    return _name_text(start)
+    return None
 
 
 def _name_text(start: bytes) -> tuple[str, str] | None:

@@ -26,7 +26,7 @@ from pipeline.logs.bags import catalog_bag
 from pipeline.logs.catalog import Catalog, keep_within
 from pipeline.logs.chunks import ByteSpan, SpanKind
 from pipeline.logs.compressed import COMPRESSED, open_inflated
-from pipeline.logs.foreign import LONGEST_START, name_foreign
+from pipeline.logs.foreign import LONGEST_START, name_foreign, name_packed
 from pipeline.logs.records import (
     LONGEST_HEAD,
     LONGEST_MAGIC,
@@ -267,6 +267,37 @@ def is_finished(path: Path) -> bool:
             return is_whole(head, size) and not is_written_to(path)
         stream.seek(max(0, size - len(rec.MAGIC)))
         return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
+
+
+class Content(NamedTuple):
+    """What a file holds, whatever its name is.
+
+    Attributes:
+        is_read: whether it is a recording that is read.
+        packed: what a recording may be packed with that is not read, and how to unpack it; None without.
+    """
+
+    is_read: bool
+    packed: tuple[str, str] | None
+
+
+def judge_content(path: Path) -> Content:
+    """What a file or object holds, by its first bytes.
+
+    Raises:
+        OSError: it cannot be read.
+        LogError: ``log_unreachable``, the object store does not answer.
+    """
+    if path.suffix in COMPRESSED:
+        return Content(is_read=True, packed=None)
+    if isinstance(path, RemotePath):
+        with open_source(path) as source:
+            start = source.read_at(0, LONGEST_START)
+    else:
+        with path.open("rb") as stream:
+            start = stream.read(LONGEST_START)
+    is_read = start.startswith(rec.MAGIC) or bool(detect_container(start))
+    return Content(is_read, name_packed(start))
 
 
 _FARM_NG: Final = b"\x0a\x08protobuf"

@@ -62,6 +62,7 @@ class LogOptions:
     Attributes:
         config: configuration file to use instead of the one beside the log.
         fleet: fleet file to apply to the log wherever it is, in addition to those in the folders above it.
+        listed: path of the log by the links that lead to it; None for the path that is given.
         overrides: configuration values from the command line, nested like the file.
         inputs: inputs to compute slip for.
         max_inflated: limit of the decompressed size of a log's chunks [bytes]; None for one by its file size.
@@ -69,6 +70,7 @@ class LogOptions:
 
     config: Path | None = None
     fleet: Path | None = None
+    listed: Path | None = None
     overrides: Mapping[str, object] = field(default_factory=dict)
     inputs: tuple[str, ...] = INPUTS
     max_inflated: int | None = None

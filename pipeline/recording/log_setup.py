@@ -82,7 +82,11 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     index = open_log(path, max_inflated=options.max_inflated)
     path = index.path
     configuration = load_configuration(
-        path, given=options.config, fleet=options.fleet, overrides=options.overrides
+        path,
+        given=options.config,
+        fleet=options.fleet,
+        listed=options.listed,
+        overrides=options.overrides,
     )
     recorded = index.deployment
     require_messages(index)

@@ -18,12 +18,13 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import polars as pl
@@ -43,6 +44,7 @@ from pipeline.core import (
     suffix_unit,
 )
 from pipeline.recording import Finding
+from pipeline.results import read_finding_table
 from pipeline.store import (
     LAST_BATCH,
     LOG_NOTES,
@@ -55,7 +57,7 @@ from pipeline.store import (
     encode_run,
     recorded_path,
 )
-from pipeline.words import NOTHING, Column
+from pipeline.words import NOTHING, Column, format_other_vehicles
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -338,6 +340,7 @@ def render_catalogue(store: Store) -> str:
         columns=columns,
         rows=rows,
         batch=format_batch(store),
+        notes=note_vehicles(manifests),
         dated=_date_errors(gathered),
         counts=[
             f"{count} {'copy' if (state, count) == ('copy', 1) else name_state(state)}"
@@ -346,6 +349,21 @@ def render_catalogue(store: Store) -> str:
         ],
         explained=[_explain(one) for one in noted if one["state"] != "done"],
     )
+
+
+def note_vehicles(manifests: Iterable[Manifest]) -> list[str]:
+    """Sentences on runs whose log indicates another vehicle than the one that is stated for it."""
+    contradictions: list[tuple[str, Mapping[str, Any]]] = []
+    for manifest in manifests:
+        # A damaged table is told by whoever verifies the results.
+        with suppress(SlipError):
+            findings = read_finding_table(manifest.read("findings"))
+            contradictions += [
+                (manifest.run, one.values)
+                for one in findings
+                if one.id == "vehicle_contradiction" and "indicated" in one.values
+            ]
+    return format_other_vehicles(contradictions)
 
 
 def _explain(noted: Mapping[str, str]) -> dict[str, str]:
@@ -391,7 +409,8 @@ def list_noted(store: Store) -> list[dict[str, str]]:
     folder, name = LAST_BATCH
     known = {one["path"] for one in noted}
     noted += [
-        {"path": str(one["path"]), "state": "left_out", "reason": str(one["reason"]), "hint": ""}
+        {"path": str(one["path"]), "state": "left_out"}
+        | {key: str(one.get(key) or "") for key in ("reason", "hint")}
         for one in objects_in(store.notes(folder).read(name) or {}, "left_out")
         if one.get("path") not in known
     ]
@@ -419,8 +438,16 @@ def format_batch(store: Store) -> str:
         return ""
     if not ended:
         return f"The last batch began on {began} and did not end: it is still running, or it was killed."
-    how = "was stopped" if note.get("stopped") else "ended"
-    return f"The last batch began on {began} and {how} on {ended}."
+    how = "was stopped" if note.get("stopped") else "failed" if note.get("failed") else "ended"
+    why = shorten(" ".join(str(note.get("failed") or "").split()), LONGEST_TEXT)
+    why = why or (f"{format_count(waiting, 'log')} not started" if (waiting := read_waiting(note)) else "")
+    return f"The last batch began on {began} and {how} on {ended}{f': {why}' if why else ''}."
+
+
+def read_waiting(note: Mapping[str, object]) -> int:
+    """How many logs the last batch did not start, by its note."""
+    waiting = note.get("not_started")
+    return waiting if isinstance(waiting, int) else 0
 
 
 def _format_moment(seconds: object) -> str:

@@ -69,7 +69,7 @@ else:
                 "convert",
                 "convert_to",
                 "is_model",
-                "match_ignored",
+                "match_globs",
                 "list_configuration_files",
                 "load_configuration",
                 "merge",

@@ -9,8 +9,8 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from pipeline.core import TomlError, parse_toml, read_bounded_text, require_finite, shorten
-from pipeline.logs import stem_of
+from pipeline.core import TomlError, objects_in, parse_toml, read_bounded_text, require_finite, shorten
+from pipeline.logs import RemotePath, stem_of
 from pipeline.sources.configuration import (
     Configuration,
     ConfigurationError,
@@ -227,29 +227,35 @@ _PLAN = re.compile(rb'(?:\s|#[^\n]*\n)*vehicle = "[^\n]*\nruns = ')
 
 
 def load_configuration(
-    log: Path, *, given: Path | None = None, fleet: Path | None = None, overrides: Tree | None = None
+    log: Path,
+    *,
+    given: Path | None = None,
+    fleet: Path | None = None,
+    listed: Path | None = None,
+    overrides: Tree | None = None,
 ) -> Configuration:
     """The configuration of one log.
 
     Every `fleet.toml` from the root of the file system down to the log's folder is read, nearer ones with
-    priority, then the given fleet file; then `run.toml` and `<log's stem>.toml` beside the log and `run.toml`
-    in a log that is a folder, or the file given instead; then overrides. A model file or a plan of that name
-    is skipped.
+    priority, with those above the links that lead to it, then the given fleet file; then `run.toml` and
+    `<log's stem>.toml` beside the log and `run.toml` in a log that is a folder, or the file given instead;
+    then overrides. A model file or a plan of that name is skipped.
 
     Args:
         log: the recording.
         given: a configuration file that replaces the one beside the log.
         fleet: a fleet file that need not be above the log; its globs are matched against every end of the
             log's path that begins with a whole folder.
+        listed: path of the log by the links that lead to it; None for the path that is given.
         overrides: values from the command line, nested like the file.
 
     Raises:
         ConfigurationError: a file is missing, not TOML, or has an unknown key or a wrong value.
     """
     layers: list[Tree] = []
-    for path in list_configuration_files(log, given=given, fleet=fleet):
+    for path in list_configuration_files(log, given=given, fleet=fleet, listed=listed):
         if path == fleet or (path.name == FLEET_FILE and path != given):
-            layers += _match_fleet(path, log.resolve())
+            layers += _match_fleet(path, (_follow(log), _keep_links(listed or log)))
         else:
             layers.append(_checked(read_toml(path), path))
     if overrides:
@@ -258,33 +264,44 @@ def load_configuration(
 
 
 def list_configuration_files(
-    log: Path, *, given: Path | None = None, fleet: Path | None = None
+    log: Path, *, given: Path | None = None, fleet: Path | None = None, listed: Path | None = None
 ) -> tuple[Path, ...]:
     """Files that configure a log, later ones with priority; arguments as of `load_configuration`.
 
     A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
     may create one in a folder like `/tmp`.
     """
-    path = _resolve(log)
+    path = _follow(log)
     beside = [path.parent / RUN_FILE, path.parent / f"{stem_of(log)}.toml"]
     folder = path if path.is_dir() else path.parent
     if folder == path:
         beside.append(folder / RUN_FILE)
-    fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
-    files = [
-        file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
+    shown = _keep_links(listed or log)
+    above = [*reversed(path.parents), *reversed(shown.parents), *([path] if folder == path else [])]
+    fleets = [
+        _follow(parent / FLEET_FILE)
+        for parent in dict.fromkeys(above)
+        if _may_speak(parent / FLEET_FILE, folder)
     ]
+    # Of a file that is above both, its nearer place counts.
+    fleets = list(dict.fromkeys(reversed(fleets)))[::-1]
+    files = [file for file in fleets if fleet is None or file != _follow(fleet)]
     files += [] if fleet is None else [fleet]
     own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
     return (*files, *(own if given is None else [given]))
 
 
-def _resolve(log: Path) -> Path:
+def _follow(log: Path) -> Path:
     """The path of a log, links resolved; a link to itself, which may be ignored, stays as it is."""
     try:
         return log.resolve()
     except RuntimeError:
         return log
+
+
+def _keep_links(log: Path) -> Path:
+    """The absolute path of a log, by the links that lead to it."""
+    return log if isinstance(log, RemotePath) else Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
 
 
 def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
@@ -393,13 +410,13 @@ def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
     return tree
 
 
-def _match_fleet(path: Path, log: Path) -> list[Tree]:
-    """Layers of a fleet file for one log: its plain keys, then every match in order."""
+def _match_fleet(path: Path, log: tuple[Path, Path]) -> list[Tree]:
+    """Layers of a fleet file for one log, by both of its paths: its plain keys, then every match in order."""
     tree = read_toml(path)
     tree.pop("ignore", None)
     matches = tree.pop("match", [])
     layers: list[Tree] = [_checked(tree, path)]
-    names = _names_under(path.resolve().parent, log)
+    names = [name for one in log for name in _names_under(path.resolve().parent, one)]
     if not isinstance(matches, list):
         raise _bad_match(path, 1)
     for number, match in enumerate(matches, start=1):
@@ -412,34 +429,40 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
     return layers
 
 
-def match_ignored(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str], bool]:
-    """Globs of logs that a batch ignores, with their fleet file, and whether they match a log.
+def match_globs(log: Path, fleet: Path | None = None) -> dict[tuple[Path, str, str], bool]:
+    """Globs of the fleet files of a log, and whether they match it.
 
     Args:
-        log: the recording.
+        log: the recording, by the links that lead to it.
         fleet: a fleet file that need not be above the log.
+
+    Returns:
+        By the file, ``ignore`` (a batch does not open the log) or ``match``, and the glob.
 
     Raises:
         ConfigurationError: ``config_invalid``, `ignore` must be a list of globs.
     """
-    matches: dict[tuple[Path, str], bool] = {}
-    # As it is listed: a link in the folder of the fleet file may lead out of it.
-    listed = Path(os.path.abspath(log))  # noqa: PTH100 - keeps links
-    above = [folder / FLEET_FILE for folder in reversed(listed.parents)]
-    files = [file for file in above if file.is_file() and _may_speak(file, listed.parent)]
-    for path in dict.fromkeys([*files, *list_configuration_files(log, fleet=fleet)]):
+    matches: dict[tuple[Path, str, str], bool] = {}
+    paths = (_follow(log), _keep_links(log))
+    for path in list_configuration_files(log, fleet=fleet):
         if path != fleet and path.name != FLEET_FILE:
             continue
-        globs = read_toml(path).get("ignore", [])
-        if not isinstance(globs, list) or not all(isinstance(one, str) for one in globs):
+        tree = read_toml(path)
+        ignored = tree.get("ignore", [])
+        if not isinstance(ignored, list) or not all(isinstance(one, str) for one in ignored):
             hint = 'Write: ignore = ["2026/dead.mcap", "*/tests/*"], above the first [table].'
             raise ConfigurationError(
                 "config_invalid", "`ignore` must be a list of globs", where=str(path), hint=hint
             )
-        names = _names_under(path.parent.absolute(), listed) + _names_under(
-            path.resolve().parent, _resolve(log)
-        )
-        matches |= {(path, glob): any(fnmatch.fnmatchcase(name, glob) for name in names) for glob in globs}
+        # What is wrong with a match is told when it is applied.
+        matched = [one.get("glob") for one in objects_in(tree, "match")]
+        rules = [*(("ignore", glob) for glob in ignored), *(("match", glob) for glob in matched)]
+        names = [name for one in paths for name in _names_under(path.resolve().parent, one)]
+        matches |= {
+            (path, kind, glob): any(fnmatch.fnmatchcase(name, glob) for name in names)
+            for kind, glob in rules
+            if isinstance(glob, str)
+        }
     return matches
 
 

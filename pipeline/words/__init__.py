@@ -76,7 +76,7 @@ else:
                 "format_remaining_error",
                 "name_span",
             ),
-            "findings": ("format_finding",),
+            "findings": ("format_finding", "format_other_vehicles"),
             "fleet": (
                 "format_fleet",
                 "format_map",

@@ -14,6 +14,7 @@ from pipeline.core import (
     format_length,
     format_line,
     format_share,
+    group_by,
     name_first,
     suffix_unit,
 )
@@ -722,6 +723,21 @@ def _vehicle_contradiction(of: Values) -> str:
         f"the {_name_source(of['source'])} of the log indicates a {of['indicated']} "
         f"({', '.join(of['differing'])}), but {named}"
     )
+
+
+def format_other_vehicles(contradictions: Sequence[tuple[str, Values]]) -> list[str]:
+    """One sentence for each vehicle that is stated for several logs which indicate another one.
+
+    Args:
+        contradictions: each run with the values of its finding ``vehicle_contradiction``.
+    """
+    groups = group_by(((str(of.get("vehicle")), str(of.get("indicated"))), run) for run, of in contradictions)
+    return [
+        f"{format_count(len(runs), 'log')} indicate{'s' * (len(runs) == 1)} a {indicated}, and not the "
+        f"{vehicle} that is stated and used: {name_first(runs)}; check [vehicle] in run.toml and fleet.toml, "
+        "or --vehicle"
+        for (vehicle, indicated), runs in sorted(groups.items())
+    ]
 
 
 _LENGTHS = {"wheel_radius_m": "a wheel radius", "track_width_m": "a track", "wheelbase_m": "a wheelbase"}

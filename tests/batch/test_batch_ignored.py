@@ -12,10 +12,8 @@ import pytest
 from verbs import run_verb
 
 from pipeline.report import _date_errors, render_catalogue
-from pipeline.sources import ConfigurationError, match_ignored
+from pipeline.sources import ConfigurationError, match_globs
 from pipeline.store import LOG_STATES, Store
-
-STATES = [state for state in LOG_STATES if state != "gone"]
 
 
 @pytest.fixture
@@ -36,17 +34,17 @@ def test_every_face_counts_and_lists_the_same_logs(folder: Path) -> None:
     for number in range(2):
         told = json.loads(run_verb(*words, cwd=folder).stdout)
         status = json.loads(run_verb("results", "status", "--results", "season", "--json", cwd=folder).stdout)
-        counts = {state: told[state] for state in STATES}
+        counts = {state: told[state] for state in LOG_STATES}
         counts["done"] += told["unchanged"]
-        assert counts == {state: status[state] for state in STATES}, number
+        assert counts == {state: status[state] for state in LOG_STATES}, number
         expected = {"done": 1, "lossy": 1, "failed": 1, "copy": 1, "ignored": 1}
         assert {state: count for state, count in counts.items() if count} == expected
         assert len(told["logs"]) == sum(counts.values())
         states = [one["state"] for one in told["logs"]]
         assert {state: told[state] for state in states} == {state: states.count(state) for state in states}
     sent = json.loads((folder / "told.json").read_text())
-    assert {state: sent[state] for state in STATES if state != "done"} == {
-        state: counts[state] for state in STATES if state != "done"
+    assert {state: sent[state] for state in LOG_STATES if state != "done"} == {
+        state: counts[state] for state in LOG_STATES if state != "done"
     }
     page = unescape((folder / "season" / "index.html").read_text())
     (line,) = re.findall(r"Logs of batches: (.*)\.</p>", page)
@@ -110,7 +108,7 @@ def test_a_log_that_is_no_longer_ignored_is_read(folder: Path) -> None:
 def test_ignore_is_a_list_of_globs(tmp_path: Path) -> None:
     (tmp_path / "fleet.toml").write_text("ignore = 3\n")
     with pytest.raises(ConfigurationError, match="list of globs"):
-        match_ignored(tmp_path / "a.mcap")
+        match_globs(tmp_path / "a.mcap")
 
 
 def test_the_index_shows_the_errors_of_each_run_and_over_dates(folder: Path) -> None:
@@ -155,6 +153,21 @@ def test_a_glob_that_matches_no_log_is_told(folder: Path) -> None:
     assert one["notes"] == []
 
 
+def test_a_match_that_fits_no_log_is_told(folder: Path) -> None:
+    fleet = folder / "field" / "fleet.toml"
+    fleet.write_text("""ignore = ["*.mcap"]
+[[match]]
+glob = "wide*"
+run.terrain = "clay"
+[[match]]
+glob = "wild*"
+run.terrain = "mud"
+""")
+    words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season", "--json")
+    notes = json.loads(run_verb(*words, cwd=folder).stdout)["notes"]
+    assert notes == [f'{fleet}: [[match]] glob = "wild*" matched no log']
+
+
 def test_links_are_ignored_as_they_are_listed(folder: Path) -> None:
     """A linked folder, a dead link and a pipe that a glob matches are not left out."""
     (folder / "other" / "inside").mkdir(parents=True)
@@ -166,3 +179,44 @@ def test_links_are_ignored_as_they_are_listed(folder: Path) -> None:
     words = ("batch", "field", "--settle", "0", "--executor", "inline", "--results", "season", "--json")
     told = json.loads(run_verb(*words, cwd=folder).stdout)
     assert (told["ignored"], told["left_out"]) == (4, 0)
+
+
+def test_logs_of_another_vehicle_than_the_stated_one_are_named(season: Path, tmp_path: Path) -> None:
+    """By the batch, every night, and by the index; the results stand."""
+    (season / "fleet.toml").write_text('[vehicle]\npreset = "husky_a200"\n')
+    words = ("batch", season, "--settle", "0", "--executor", "inline", "--results", "out")
+    for _ in range(2):
+        (note,) = json.loads(run_verb(*words, "--json", cwd=tmp_path).stdout)["notes"]
+        assert note.startswith(
+            "1 log indicates a Clearpath Warthog, and not the Clearpath Husky A200 that is"
+        )
+        assert "season/d; check [vehicle]" in note
+    assert note in unescape((tmp_path / "out" / "index.html").read_text())
+    (season / "fleet.toml").unlink()
+    assert json.loads(run_verb(*words, "--json", cwd=tmp_path).stdout)["notes"] == []
+    assert "indicates a" not in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_fleet_file_reaches_the_logs_behind_a_link(season: Path, tmp_path: Path) -> None:
+    """As they are listed: by its plain keys and by the globs of its matches."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "husky_7").symlink_to(season)
+    (season / "b.mcap").rename(tmp_path / "b.mcap")
+    (logs / "one.mcap").symlink_to(tmp_path / "b.mcap")
+    match = '[[match]]\nglob = "husky_7/*"\n[match.run]\nterrain = "clay"\n'
+    (logs / "fleet.toml").write_text(f'[run]\nterrain = "mud"\n{match}')
+    words = ("batch", "logs", "--settle", "0", "--executor", "inline", "--results", "out")
+    for _ in range(2):
+        run_verb(*words, cwd=tmp_path)
+        runs = Store(tmp_path / "out").query("SELECT run, terrain FROM runs ORDER BY run")
+        assert {run[-1]: terrain for run, terrain in runs.rows()} == {"b": "mud"} | dict.fromkeys(
+            "acd", "clay"
+        )
+    (logs / "fleet.toml").write_text('[run]\nterrain = "mud"\n')
+    (season / "fleet.toml").write_text('[run]\ndataset = "near"\n')
+    run_verb(*words, cwd=tmp_path)
+    runs = Store(tmp_path / "out").query("SELECT terrain, dataset FROM runs")
+    assert sorted(runs.rows())[1:] == [("mud", "near")] * 3
+    run_verb("analyze", "logs/husky_7/a.mcap", "--results", "other", "--no-report", cwd=tmp_path)
+    assert Store(tmp_path / "other").query("SELECT terrain FROM runs")["terrain"].to_list() == ["mud"]

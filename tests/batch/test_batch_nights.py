@@ -147,6 +147,10 @@ def test_a_full_disk_is_told_first_and_those_it_stopped_as_one(field: Path) -> N
     assert errors[0][1].code == "disk_full"
     assert (errors[-1][1].code, errors[-1][1].what[:24]) == ("not_started", "18 logs were not started")
     assert counts(outcome)["not_started"] == 18
+    assert ask_verb("results", "status", "--results", "out")["not_started"] == 18
+    assert re.search(
+        "last batch .*, 18 logs not started", run_slip("results", "status", "--results", "out")[1]
+    )
 
 
 def test_results_of_a_log_that_is_gone_can_be_removed(field: Path) -> None:

@@ -1,6 +1,7 @@
 """What a batch tells after its logs, once, to a command of the user."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -84,3 +85,57 @@ def test_names_reach_the_command_as_data(field: Path) -> None:
     assert run_slip("batch", "field", *INLINE, "--notify", TELL)[0] == 1
     assert not Path("bad").exists()
     assert len(read_message()["notified"]) == 5
+
+
+def test_logs_that_are_gone_are_told_once(field: Path, originals: Path) -> None:
+    """Of the folder that was searched; one that was moved is not gone."""
+    for name in ("cut", "broken"):
+        (field / f"{name}.mcap").unlink()
+    (field / "robot_b").mkdir()
+    for name in ("b", "c"):
+        shutil.copy(originals / f"{name}.mcap", field / "robot_b")
+    words = ("batch", "field", *INLINE, "--notify", TELL)
+    assert ask_verb(*words)["gone"] == 0
+    (field / "robot_b" / "c.mcap").rename(field / "moved.mcap")
+    shutil.rmtree(field / "robot_b")
+    assert ask_verb("batch", "field/a.mcap", *INLINE)["gone"] == 0
+    answer = ask_verb(*words, code=3)
+    assert answer["gone"] == 1
+    (line,) = [one for one in answer["logs"] if one["state"] == "gone"]
+    assert (line["path"], line["run"]) == (str(field / "robot_b" / "b.mcap"), "robot_b/b")
+    assert answer["notified"] == [f"{line['path']}: the log is not there any more; its results are kept"]
+    again = ask_verb(*words)
+    assert (again["gone"], again["notified"], count_told()) == (1, [], 1)
+    screen = run_slip(*words)[1]
+    assert "gone, as before" in screen
+    assert "gone               1" in screen
+    assert ask_verb("results", "status")["gone"] == 1
+
+
+def test_what_is_left_out_again_is_said_as_before(field: Path) -> None:
+    (field / "dead.mcap").symlink_to("nothing")
+    words = ("batch", "field", *INLINE)
+    assert "left out, new" in run_slip(*words)[1]
+    assert "left out, as before" in run_slip(*words)[1]
+    (field / "dead.mcap").unlink()
+    assert "left out" not in run_slip(*words)[1]
+    (field / "dead.mcap").symlink_to("nothing")
+    assert "left out, new" in run_slip(*words)[1]
+
+
+def test_a_night_with_a_broken_fleet_file_makes_nothing_new_again(field: Path) -> None:
+    """It is told itself, in the status and on the index as well."""
+    words = ("batch", "field", *INLINE, "--notify", TELL)
+    assert len(ask_verb(*words, code=1)["notified"]) == 2
+    fleet = field / "fleet.toml"
+    fleet.write_text("ignore = [\n")
+    (told,) = ask_verb(*words, code=1)["notified"]
+    assert "fleet.toml" in told
+    assert "fleet.toml" in ask_verb("results", "status")["failed_before_logs"]
+    assert re.search("last batch .*, failed: .*fleet.toml", run_slip("results", "status")[1])
+    assert re.search(
+        "The last batch began on .* and failed on .*fleet.toml", Path("results/index.html").read_text()
+    )
+    fleet.unlink()
+    assert ask_verb(*words, code=3)["notified"] == []
+    assert ask_verb("results", "status")["failed_before_logs"] is None

@@ -45,8 +45,8 @@ def test_each_kind_of_poison_is_named_and_the_others_are_done(season: Path, tmp_
     assert clean.pop("index.html")
     assert made == clean
 
-    # The quarantined ones are left alone; the others have another chance.
-    again = batch(season, tmp_path / "out")
+    # The quarantined ones are left alone with the same limits; the others have another chance.
+    again = batch(season, tmp_path / "out", **LIMITS)
     assert counts(again)["quarantined"] == 5
     assert {Path(line.path).stem for line in again.lines if line.state == "quarantined"} == {
         "hangs", "holds", "eats", "dies", "leaves",
@@ -62,3 +62,20 @@ def test_a_log_that_changed_leaves_the_quarantine(season: Path, tmp_path: Path) 
     assert counts(batch(log, tmp_path / "out", work=work_poisoned, **LIMITS)) == {"quarantined": 1}
     log.write_bytes((season / "b.mcap").read_bytes())
     assert counts(batch(log, tmp_path / "out")) == {"done": 1}
+
+
+def test_a_log_that_gets_more_time_or_memory_leaves_the_quarantine(season: Path, tmp_path: Path) -> None:
+    (season / "hangs.mcap").write_bytes((season / "a.mcap").read_bytes() + b"1")
+    (season / "eats.mcap").write_bytes((season / "a.mcap").read_bytes() + b"2")
+    (season / "dies.mcap").write_bytes((season / "a.mcap").read_bytes() + b"3")
+    for name in "abcd":
+        (season / f"{name}.mcap").unlink()
+    out = tmp_path / "out"
+    assert counts(batch(season, out, work=work_poisoned, **LIMITS)) == {"quarantined": 3}
+    assert counts(batch(season, out, **(LIMITS | {"timeout_s": 2.0}))) == {"quarantined": 3}
+    longer = batch(season, out, **(LIMITS | {"timeout_s": 60.0}))
+    done = {Path(line.path).stem for line in longer.lines if line.state != "quarantined"}
+    assert done == {"hangs"}
+    larger = batch(season, out, **(LIMITS | {"memory_bytes": 3_000_000_000}))
+    left = [line for line in larger.lines if line.state == "quarantined"]
+    assert [Path(line.path).stem for line in left] == ["dies"]

@@ -80,3 +80,26 @@ def test_logs_still_being_written_are_left(tree: Path) -> None:
     for path in [tree / "a.mcap", *tree.glob("split/*"), *tree.glob("run_1/*")]:
         os.utime(path, (long_ago, long_ago))
     assert find_recordings([str(tree)], settle_s=60.0).growing == ()
+
+
+def test_a_rotated_or_renamed_recording_is_read_and_a_packed_one_is_named(tmp_path: Path) -> None:
+    """What follows the suffix does not hide a recording; what is no recording stays unmentioned."""
+    read = ("rot.mcap.1", "plain.MCAP", "run.mcap.active", "old.BAG", "dated.mcap-20260705", "z.mcap.2.zst")
+    for name in read:
+        (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n" if "BAG" in name else WHOLE)
+    packed = {
+        "rot.mcap.3.gz": b"\x1f\x8b\x08",
+        "old.mcap.xz": b"\xfd7zXZ\0",
+        "X.MCAP.ZST": b"\x28\xb5\x2f\xfd",
+    }
+    for name, start in packed.items():
+        (tmp_path / name).write_bytes(start + bytes(100))
+    for name in ("a.mcap.md5", "a.mcap.txt", "a.db3-wal", "mcap", "a.mcapital", "b.gz"):
+        (tmp_path / name).write_bytes(b"\x1f\x8b" if name == "b.gz" else b"1c2f a.mcap\n")
+    found = find_recordings([str(tmp_path)], settle_s=0.0)
+    assert sorted(names(found.recordings, tmp_path)) == sorted(read)
+    assert {each.path.name: each.is_entry for each in found.skipped} == dict.fromkeys(packed, True)
+    reasons = {each.path.name: f"{each.reason}: {each.hint}" for each in found.skipped}
+    assert "compressed with gzip: Unpack it" in reasons["rot.mcap.3.gz"]
+    assert "zstd -d" in reasons["X.MCAP.ZST"]
+    assert find_recordings([str(tmp_path / "*")], settle_s=0.0) == found

@@ -123,6 +123,8 @@ def test_results_that_were_made_otherwise_are_not_replaced_without_a_word(
     assert "earlier results, made with vehicle.preset = not set (now warthog)" in print_verb(*batch)
     (line,) = ask_verb(*batch[:-1], "husky_a200")["logs"]
     assert line["replaced"].startswith("made with vehicle.preset = warthog (now husky_a200); ")
+    (line,) = ask_verb(*batch, "--prune", "--keep", 0)["logs"]
+    assert line["replaced"].endswith("preset = husky_a200 (now warthog); they were removed")
     stage = ("results", "stage", "slip", log, "--results", tmp_path / "out", "--force")
     assert "with a summary, which the new ones lack; " in print_verb(*stage)
 

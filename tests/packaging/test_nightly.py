@@ -29,10 +29,13 @@ def home(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(command: str, home: Path, folder: Path) -> None:
+def run(command: str, home: Path, folder: Path, code: int = 0) -> str:
     around = os.environ | {"HOME": str(home), "PYTHONPATH": str(HERE)}
-    done = subprocess.run(command, shell=True, cwd=folder, env=around, capture_output=True, text=True)  # noqa: PLW1510, S602
-    assert done.returncode == 0, done.stderr
+    done = subprocess.run(
+        ["/bin/bash", "-c", command], check=False, cwd=folder, env=around, capture_output=True, text=True
+    )
+    assert done.returncode == code, done.stderr
+    return done.stdout
 
 
 def test_the_service_brings_the_results_up_to_date(home: Path) -> None:
@@ -61,7 +64,8 @@ def test_systemd_accepts_the_units(home: Path) -> None:
 @pytest.mark.skipif(not shutil.which("flock"), reason="there is no flock here")
 def test_the_crontab_does_the_same_and_never_twice_at_once(home: Path) -> None:
     lines = [line for line in (RECIPES / "slip-batch.cron").read_text().splitlines() if line[0] != "#"]
-    (nightly, late) = (line.replace("| logger --tag slip-batch", "") for line in lines)
+    assert lines.pop(0) == "SHELL=/bin/bash"
+    (nightly, late) = (line.replace("| logger --tag slip-batch", "| cat") for line in lines)
     command = nightly.removeprefix("0 2 * * * ")
     # A bare percent sign ends the command of a crontab.
     assert "%" not in command
@@ -72,3 +76,8 @@ def test_the_crontab_does_the_same_and_never_twice_at_once(home: Path) -> None:
     assert not (home / "robots" / "results").exists()
     run(command, home, home)
     assert Store(home / "robots" / "results").runs() == ("logs/a",)
+
+    (home / "robots" / "logs" / "bad.mcap").write_text("no log\n" * 100)
+    assert "slip batch failed: journalctl" in run(command, home, home, 1)
+    # The same log again is no new failure.
+    run(command, home, home)
