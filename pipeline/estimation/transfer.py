@@ -157,7 +157,7 @@ def describe_left(left: Mapping[str, tuple[float, float]]) -> str:
     """How much of the ideal model's error a model leaves, and how much a fit to the run."""
     given = enumerate_texts([f"{format_share(pair[0])} in {name}" for name, pair in left.items()])
     own = enumerate_texts([format_share(pair[1]) for pair in left.values()])
-    return f"of the ideal model's error {given} remain, with a fit to that run {own}"
+    return f"it leaves {given} of the ideal model's error, a refit {own}"
 
 
 def describe_beyond(beyond: Mapping[str, float]) -> str:
