@@ -42,7 +42,7 @@ class Transfer:
         ideal: errors of the ideal model.
         ratio: ratio of carried to own, geometric mean over the channels x, y, w.
         apart: the same of the errors over 2 s, by `position` and `heading`; those that are known.
-        left: errors over 2 s in parts of the ideal model's, of carried and of own, by `position` and
+        remaining: errors over 2 s in parts of the ideal model's, of carried and of own, by `position` and
             `heading`; those of velocities where neither is known.
         renewed: labels of parameters of the recording, such as its clock, which were fitted anew.
         beyond: how many times faster than in the runs of the fit it drives or turns here, by `speed` and
@@ -57,7 +57,7 @@ class Transfer:
     ideal: HeldOut
     ratio: float
     apart: Mapping[str, float]
-    left: Mapping[str, tuple[float, float]]
+    remaining: Mapping[str, tuple[float, float]]
     renewed: Sequence[str]
     beyond: Mapping[str, float]
     warning: str
@@ -90,17 +90,17 @@ def carry_over(
         ratio = float(np.exp(np.mean(np.log(velocities))))
         pairs = {"position": position, "heading": heading}
         apart = {name: one for name, one in pairs.items() if math.isfinite(one)}
-        left, beyond = _find_left(carried, own, ideal), _find_beyond(data, fitted_on)
-        warning = _warn(run, left, renewed, beyond, [str(row.get("terrain")) for row in fitted_on])
+        remaining, beyond = _compare_with_ideal(carried, own, ideal), _find_beyond(data, fitted_on)
+        warning = _warn(run, remaining, renewed, beyond, [str(row.get("terrain")) for row in fitted_on])
         held_out = carried, own, ideal
         transfers.append(
-            Transfer(run.name, run.terrain, *held_out, ratio, apart, left, renewed, beyond, warning)
+            Transfer(run.name, run.terrain, *held_out, ratio, apart, remaining, renewed, beyond, warning)
         )
     return transfers
 
 
-def _find_left(carried: HeldOut, own: HeldOut, ideal: HeldOut) -> dict[str, tuple[float, float]]:
-    """Errors of two models in parts of the ideal one's; see `Transfer.left`."""
+def _compare_with_ideal(carried: HeldOut, own: HeldOut, ideal: HeldOut) -> dict[str, tuple[float, float]]:
+    """Errors of two models in parts of the ideal one's; see `Transfer.remaining`."""
     both = zip(*(one.pooled.ratios(ideal.pooled) for one in (carried, own)), strict=True)
     named = dict(zip((*_VELOCITIES, "position", "heading"), both, strict=True))
     known = {name: pair for name, pair in named.items() if all(map(math.isfinite, pair))}
@@ -137,27 +137,29 @@ def _find_beyond(data: EstimationData, fitted_on: Sequence[Mapping[str, object]]
 
 def _warn(
     run: MotionRun,
-    left: Mapping[str, tuple[float, float]],
+    remaining: Mapping[str, tuple[float, float]],
     renewed: Sequence[str],
     beyond: Mapping[str, float],
     terrains: Sequence[str],
 ) -> str:
-    failing = {name: pair for name, pair in left.items() if pair[0] - pair[1] > LOST}
+    failing = {name: pair for name, pair in remaining.items() if pair[0] - pair[1] > LOST}
     if not failing:
         return ""
     where = f" on {run.terrain}" if run.terrain != "unknown" else ""
     came = f" (fitted on {', '.join(sorted(set(terrains)))})" if terrains else ""
-    of = f" in {next(iter(failing))} alone" if len(failing) == 1 < len(left) else ""
+    of = f" in {next(iter(failing))} alone" if len(failing) == 1 < len(remaining) else ""
     again = f" with its {enumerate_texts(renewed)} fitted anew" if renewed else ""
-    text = f"the model{came} does not transfer to {run.name}{where}{of}: {describe_left(failing)}{again}"
+    text = (
+        f"the model{came} does not transfer to {run.name}{where}{of} ({describe_remaining(failing)}){again}"
+    )
     return f"{text}; the run is {describe_beyond(beyond)}" if beyond else text
 
 
-def describe_left(left: Mapping[str, tuple[float, float]]) -> str:
+def describe_remaining(remaining: Mapping[str, tuple[float, float]]) -> str:
     """How much of the ideal model's error a model leaves, and how much a fit to the run."""
-    given = enumerate_texts([f"{format_share(pair[0])} in {name}" for name, pair in left.items()])
-    own = enumerate_texts([format_share(pair[1]) for pair in left.values()])
-    return f"it leaves {given} of the ideal model's error, a refit {own}"
+    given = enumerate_texts([f"{format_share(pair[0])} in {name}" for name, pair in remaining.items()])
+    own = enumerate_texts([format_share(pair[1]) for pair in remaining.values()])
+    return f"ideal model's error left: {given}, refitted {own}"
 
 
 def describe_beyond(beyond: Mapping[str, float]) -> str:

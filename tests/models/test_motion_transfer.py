@@ -45,11 +45,11 @@ def test_what_fails_and_faster_driving_than_in_the_fit_are_told_apart() -> None:
     assert said in item.warning
     lines = format_transfers([("tile.toml", item)])
     assert f"  {said}" in lines
-    given, own = item.left["heading"]
+    given, own = item.remaining["heading"]
     assert given - own > 0.1
     assert any(f"{format_share(given)} in heading" in line for line in lines)
     # The heading alone, where the position is nearly as good as with a fit to the run.
-    given, own = item.left["position"]
+    given, own = item.remaining["position"]
     assert ("in heading alone" in item.warning) == (given - own <= 0.1)
 
 
@@ -59,7 +59,7 @@ def test_twice_an_error_that_is_nearly_none_is_no_failure() -> None:
     fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in TILE)))
     near = fitted.model.change("effective_track", k=1.01 * TILE["effective_track"])
     (item,) = carry_over(near, [other], Input.MEASURED)
-    given, own = item.left["heading"]
+    given, own = item.remaining["heading"]
     assert item.apart["heading"] > 1.5
     assert given - own < 0.1
     assert item.warning == ""
