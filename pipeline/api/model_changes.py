@@ -278,6 +278,10 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
         "ideal": to_json(item.ideal.pooled),
         "ratio": item.ratio,
         "ratios": dict(item.apart),
+        "remaining_of_ideal": {
+            name: {"carried": given, "own_fit": own} for name, (given, own) in item.remaining.items()
+        },
+        "fitted_anew": list(item.renewed),
         "beyond_fit": dict(item.beyond),
         "warning": item.warning,
     }

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.estimation.decision import SHOWN, find_expected_fall, judge
 from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors
 from pipeline.estimation.matrix import Matrix
-from pipeline.estimation.plausibility import is_nameable
+from pipeline.estimation.plausibility import explain_form, is_nameable
 from pipeline.models import Model, explain_idle, find_effect
 from pipeline.run import MotionError
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pipeline.core import Floats
     from pipeline.estimation.estimation_data import EstimationData
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.models import Conditions, Effect, Parameter
+    from pipeline.models import Effect
     from pipeline.results import Errors
 
 MOST_FITTED = 6
@@ -91,24 +91,8 @@ def explain_refusals(step: LadderStep, names: Collection[str]) -> dict[str, str]
             if idle := explain_idle(effect, step.effects):
                 refusals[effect.id] = f"it {idle}"
             elif why := judge(fit, effect, matrix, data.conditions).refusal:
-                refusals[effect.id] = _explain_values(effect, data.conditions) or why
+                refusals[effect.id] = explain_form(effect, data.conditions) or why
     return refusals
-
-
-def _explain_values(effect: Effect, conditions: Conditions) -> str:
-    """What is wrong with values that no vehicle has; empty where they could be."""
-    for parameter in effect.parameters:
-        value = effect.values[parameter.name]
-        if parameter.one_sign and value <= parameter.neutral:
-            return (
-                f"{parameter.name} = {_format_value(value, parameter, digits=2)} is not possible: "
-                f"it must be above {_format_value(parameter.neutral, parameter)}"
-            )
-    if not effect.is_degenerate(conditions):
-        return ""
-    simpler = effect.collapse()
-    as_what = "it has no effect of its own on this run" if simpler is None else f"it acts as {simpler.id}"
-    return f"with these values {as_what}"
 
 
 def list_promising(data: EstimationData, fitted: Fitted) -> list[str]:
@@ -232,8 +216,3 @@ def _measure_remaining(before: Errors, after: Errors) -> float:
     """Remaining share of the 2 s errors: that of position times that of heading."""
     position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)
-
-
-def _format_value(value: float, parameter: Parameter, digits: int = 3) -> str:
-    text = f"{value:.{digits}g}"
-    return text if parameter.unit == "1" else f"{text} {parameter.unit}"

@@ -32,7 +32,7 @@ from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.matrix import Matrix, Move
 from pipeline.estimation.model_state import combine_columns, pick_columns
 from pipeline.estimation.noise import huber_cost
-from pipeline.estimation.plausibility import is_nameable, is_possible, is_too_small
+from pipeline.estimation.plausibility import explain_impossible, is_nameable, is_possible, is_too_small
 from pipeline.models import Least
 from pipeline.models import Search as HowSearched
 
@@ -658,7 +658,9 @@ def judge(
     ):
         is_small = all(is_too_small(one, conditions) for one in acting)
         refusal = (
-            "it is smaller than data sheets and stamps err" if is_small else "its values are not possible"
+            "it is smaller than data sheets and stamps err"
+            if is_small
+            else explain_impossible(acting[0], conditions)
         )
     elif measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
         refusal = "its 95 % interval includes no effect"
@@ -672,7 +674,10 @@ def judge(
     else:
         is_proven = True
         if felt < SHOWN:
-            refusal = f"no error falls by more than {format_share(felt)}, required {format_share(SHOWN)}"
+            refusal = (
+                f"no error against {path.target} falls by more than {format_share(felt)}, "
+                f"required {format_share(SHOWN)}"
+            )
         elif not _is_material(path, change):
             refusal = "what it moves is less than a map resolves"
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)

@@ -89,6 +89,7 @@ class PathResiduals(ABC):
         clocks: ids of effects that are a clock of each single run.
         grounds: numbers of the runs on each ground; one empty group where all are on one.
         title: name of the path.
+        target: what its predictions are compared with.
     """
 
     prior: Prior = NO_PRIOR
@@ -97,6 +98,7 @@ class PathResiduals(ABC):
     is_delayed: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
     title: str
+    target: str = "the poses"
 
     def __init__(self, residuals_by_run: Sequence[RunResiduals], delays: tuple[DelayName, ...] = ()) -> None:
         self.residuals_by_run = tuple(residuals_by_run)
@@ -356,6 +358,7 @@ class WheelResiduals(PathResiduals):
     """
 
     title = "Drivetrain effects"
+    target = "the measured wheels"
     dates_poses = False
     is_delayed = False
 

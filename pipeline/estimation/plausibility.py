@@ -124,6 +124,48 @@ def list_implausible(effect: Effect) -> list[Parameter]:
     return wild
 
 
+def explain_form(effect: Effect, conditions: Conditions) -> str:
+    """What is wrong with values of the wrong sign, or that make it another effect; empty if nothing is."""
+    for parameter in effect.parameters:
+        value = effect.values[parameter.name]
+        if parameter.one_sign and value <= parameter.neutral:
+            return _refuse_value(
+                parameter, value, f"it must be above {_format_value(parameter.neutral, parameter)}"
+            )
+    if not effect.is_degenerate(conditions):
+        return ""
+    simpler = effect.collapse()
+    as_what = "it has no effect of its own on this run" if simpler is None else f"it acts as {simpler.id}"
+    return f"with these values {as_what}"
+
+
+def explain_impossible(effect: Effect, conditions: Conditions) -> str:
+    """Which value of an effect that is not possible is not, and by what; see `is_possible`."""
+    if form := explain_form(effect, conditions):
+        return form
+    for parameter in list_implausible(effect):
+        value, shown = effect.values[parameter.name], parameter.plausible
+        low, high = parameter.bounds if shown is None else (shown.low, shown.high)
+        what = "it is at the end of its range," if low <= value <= high else "vehicles have"
+        ends = f"{_format_value(low, parameter)} to {_format_value(high, parameter)}"
+        return _refuse_value(parameter, value, f"{what} {ends}")
+    for parameter in effect.parameters:
+        most = conditions.exceeded.get(parameter.relative_to)
+        if most is not None and is_exceeded(effect, conditions):
+            reached = f"the measured wheels reach {_format_value(most, parameter)}"
+            return _refuse_value(parameter, effect.values[parameter.name], reached)
+    return "its values are not possible"
+
+
+def _refuse_value(parameter: Parameter, value: float, why: str) -> str:
+    return f"{parameter.name} = {_format_value(value, parameter, digits=2)} is not possible: {why}"
+
+
+def _format_value(value: float, parameter: Parameter, digits: int = 3) -> str:
+    text = f"{value:.{digits}g}"
+    return text if parameter.unit == "1" else f"{text} {parameter.unit}"
+
+
 def measure_moves(fitted: Fitted, effect: Effect) -> Moves | None:
     """Change of a fitted model's predictions by one of its effects; None where the model lacks the effect.
 

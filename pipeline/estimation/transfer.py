@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import enumerate_texts
+from pipeline.core import enumerate_texts, format_share
 from pipeline.estimation.estimation_data import EstimationData
 from pipeline.estimation.held_out import HeldOut, hold_out
 from pipeline.estimation.ladder import measure_driven
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN
-from pipeline.models import Model
+from pipeline.models import Late, Model
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,8 +22,12 @@ if TYPE_CHECKING:
     from pipeline.estimation.run_residuals import Input
     from pipeline.run import MotionRun
 
-CARRIES_OVER = 1.1
-"""Largest ratio of a model's error on another run to that of a fit to that run for it to transfer."""
+LOST = 0.1
+"""Largest error that a model has on another run beyond that of a fit to that run, in parts of the ideal
+model's, for it to transfer: where a fit leaves nearly nothing of that error, twice as much is no failure."""
+_FASTER = 1.1
+"""Ratio of the driven speeds from which on a run is driven faster than those of a fit."""
+_VELOCITIES = ("forward speed", "lateral speed", "yaw rate")
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,9 @@ class Transfer:
         ideal: errors of the ideal model.
         ratio: ratio of carried to own, geometric mean over the channels x, y, w.
         apart: the same of the errors over 2 s, by `position` and `heading`; those that are known.
+        remaining: errors over 2 s in parts of the ideal model's, of carried and of own, by `position` and
+            `heading`; those of velocities where neither is known.
+        renewed: labels of parameters of the recording, such as its clock, which were fitted anew.
         beyond: how many times faster than in the runs of the fit it drives or turns here, by `speed` and
             `yaw rate`; those of which the model knows too little.
         warning: reason not to trust the model here; empty if it transfers.
@@ -50,6 +57,8 @@ class Transfer:
     ideal: HeldOut
     ratio: float
     apart: Mapping[str, float]
+    remaining: Mapping[str, tuple[float, float]]
+    renewed: Sequence[str]
     beyond: Mapping[str, float]
     warning: str
 
@@ -71,7 +80,7 @@ def carry_over(
         fitted_on: the runs of the fit as a model file lists them, for the warning.
         per_run: labels of parameters with one value per run, which are fitted to each run.
     """
-    transfers = []
+    transfers, renewed = [], _list_of_recording(model)
     for run in runs:
         data = EstimationData([run], model.vehicle, source)
         carried = hold_out(data, fit_as_it_is(data, model, per_run))
@@ -81,21 +90,36 @@ def carry_over(
         ratio = float(np.exp(np.mean(np.log(velocities))))
         pairs = {"position": position, "heading": heading}
         apart = {name: one for name, one in pairs.items() if math.isfinite(one)}
-        beyond = _find_beyond(data, fitted_on)
-        warning = _warn(run, ratio, apart, beyond, [str(row.get("terrain")) for row in fitted_on])
-        transfers.append(Transfer(run.name, run.terrain, carried, own, ideal, ratio, apart, beyond, warning))
+        remaining, beyond = _compare_with_ideal(carried, own, ideal), _find_beyond(data, fitted_on)
+        warning = _warn(run, remaining, renewed, beyond, [str(row.get("terrain")) for row in fitted_on])
+        held_out = carried, own, ideal
+        transfers.append(
+            Transfer(run.name, run.terrain, *held_out, ratio, apart, remaining, renewed, beyond, warning)
+        )
     return transfers
+
+
+def _compare_with_ideal(carried: HeldOut, own: HeldOut, ideal: HeldOut) -> dict[str, tuple[float, float]]:
+    """Errors of two models in parts of the ideal one's; see `Transfer.remaining`."""
+    both = zip(*(one.pooled.ratios(ideal.pooled) for one in (carried, own)), strict=True)
+    named = dict(zip((*_VELOCITIES, "position", "heading"), both, strict=True))
+    known = {name: pair for name, pair in named.items() if all(map(math.isfinite, pair))}
+    over_2_s = {name: pair for name, pair in known.items() if name not in _VELOCITIES}
+    return over_2_s or known
+
+
+def _list_of_recording(model: Model) -> list[str]:
+    """Labels of parameters that belong to a recording and not to the robot: the clock of its poses."""
+    return [f"{effect.id}.{name}" for effect in model if effect.late is Late.POSES for name in effect.values]
 
 
 def fit_as_it_is(data: EstimationData, model: Model, per_run: Sequence[str] = ()) -> Fitted:
     """A model with its values: only delays of the recording and parameters of single runs are fitted."""
+    free = {*per_run, *_list_of_recording(model)}
     return fit_model(
         data,
         model.swap(
-            *(
-                effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in per_run))
-                for effect in model
-            )
+            *(effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in free)) for effect in model)
         ),
     )
 
@@ -106,32 +130,36 @@ def _find_beyond(data: EstimationData, fitted_on: Sequence[Mapping[str, object]]
     beyond = dict[str, float]()
     for name, key in {"speed": DRIVEN_SPEED, "yaw rate": DRIVEN_TURN}.items():
         most = max((float(one) for row in fitted_on if isinstance(one := row.get(key), float)), default=0.0)
-        if most > 0.0 and driven[key] > CARRIES_OVER * most:
+        if most > 0.0 and driven[key] > _FASTER * most:
             beyond[name] = driven[key] / most
     return beyond
 
 
 def _warn(
     run: MotionRun,
-    ratio: float,
-    apart: Mapping[str, float],
+    remaining: Mapping[str, tuple[float, float]],
+    renewed: Sequence[str],
     beyond: Mapping[str, float],
     terrains: Sequence[str],
 ) -> str:
-    failing = {name: one for name, one in apart.items() if one > CARRIES_OVER}
-    if not failing and ratio <= CARRIES_OVER:
+    failing = {name: pair for name, pair in remaining.items() if pair[0] - pair[1] > LOST}
+    if not failing:
         return ""
     where = f" on {run.terrain}" if run.terrain != "unknown" else ""
     came = f" (fitted on {', '.join(sorted(set(terrains)))})" if terrains else ""
-    of = f" in {next(iter(failing))} alone" if len(failing) == 1 < len(apart) else ""
-    said = enumerate_texts([f"{one:.2f}" for one in failing.values()] or [f"{ratio:.2f}"])
-    each = " and ".join(failing) if len(failing) > 1 else ""
-    errors = f"its errors{f' of {each}' if each else ''} are"
+    of = f" in {next(iter(failing))} alone" if len(failing) == 1 < len(remaining) else ""
+    again = f" with its {enumerate_texts(renewed)} fitted anew" if renewed else ""
     text = (
-        f"the model{came} does not transfer to {run.name}{where}{of}: {errors} {said} times "
-        "those of a fit to that run"
+        f"the model{came} does not transfer to {run.name}{where}{of} ({describe_remaining(failing)}){again}"
     )
-    return f"{text}, which is {describe_beyond(beyond)}" if beyond else text
+    return f"{text}; the run is {describe_beyond(beyond)}" if beyond else text
+
+
+def describe_remaining(remaining: Mapping[str, tuple[float, float]]) -> str:
+    """How much of the ideal model's error a model leaves, and how much a fit to the run."""
+    given = enumerate_texts([f"{format_share(pair[0])} in {name}" for name, pair in remaining.items()])
+    own = enumerate_texts([format_share(pair[1]) for pair in remaining.values()])
+    return f"ideal model's error left: {given}, refitted {own}"
 
 
 def describe_beyond(beyond: Mapping[str, float]) -> str:

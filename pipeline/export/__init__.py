@@ -14,10 +14,10 @@ import pkgutil
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from pipeline.core import (
     INPUT_WORDS,
@@ -208,18 +208,18 @@ def export_model(file: ModelFile, name: str, current: Current | None = None, gat
             where=facts.vehicle.id,
             hint="Export to another target: json and python take every vehicle.",
         )
-    doubtful = list_omitted(file, name)
     head = [
         f"{quote_name(facts.vehicle.name)}: {target.about}.",
         f"Names: {target.source}.",
         *facts.list_origin(),
         facts.vehicle.format_unknown(),
-        "What depends on a value in doubt is commented out." if doubtful else "",
     ]
     table = ParameterTable([line for line in head if line])
     for row in target.rows:
         if not row.kinds or facts.vehicle.kind in row.kinds:
             _fill_row(row, facts, table, used)
+    if list_omitted(file, name) or any(setting.is_doubtful for setting in table.settings):
+        table.head.append("What depends on a value in doubt is commented out.")
     if target.complete is not None:
         target.complete(facts, table, *([gate or target.gates[0]] if target.gates else []))
     return (target.write or write_yaml)(facts, table)
@@ -291,6 +291,15 @@ _TRIED = 0.1
 """Change of a parameter that shows whether a delay depends on it, in parts of it or of a typical one."""
 _UNCHANGED_S = 5e-3
 """Change of a delay that is none [s]: a tenth of a step of MPPI."""
+_STEPS = (1.0, 0.5, 0.25)
+"""Steps whose delays are compared, in parts of the largest driven motion."""
+_ONE_DELAY = 1.5
+"""Ratio of the delays of these steps up to which one stands for all."""
+_MPPI_STEP_S = 0.05
+"""Usual step of MPPI [s]: delays that differ by less are one."""
+_DRIVEN = 4.0
+"""Ratio of the 99th percentile of a motion to the rms of the noise floor from which on it was driven: that of
+noise alone is 2.6."""
 _DIGEST = 12
 """Digits of a recording's hash that tell it from all others."""
 _MOST_GROUNDS = 5
@@ -346,8 +355,11 @@ class Amount:
     def change(self, function: Callable[..., float], *given: Amount) -> Amount:
         """Convert the value to another quantity, such as a body limit to a wheel limit by the wheel's radius.
 
-        The effects of the given values are listed as sources, but not as effects covered by the result.
+        The effects of the given values are listed as sources, but not as effects covered by the result. What
+        nothing is known of stays unknown, whatever is known of the given values.
         """
+        if not self.sources:
+            return Amount(math.nan)
         return replace(combine(function, self, *given), effects=self.effects)
 
 
@@ -368,6 +380,19 @@ def _compute(function: Callable[..., float], *amounts: Amount) -> float:
 
 def _unite(*amounts: Amount) -> tuple[str, ...]:
     return tuple(dict.fromkeys(line for amount in amounts for line in amount.sources))
+
+
+class _Motion(NamedTuple):
+    """A motion of the body: key of its largest driven value, its channel, and words for it."""
+
+    driven: str
+    channel: int
+    did: str
+    other: str
+
+
+_AHEAD = _Motion(DRIVEN_SPEED, 0, "drove ahead", "turning")
+_TURNING = _Motion(DRIVEN_TURN, 2, "turned", "driving")
 
 
 @dataclass(frozen=True)
@@ -520,27 +545,44 @@ class Facts:
         return combine(_find_circle, self.find_wheelbase(), angle)
 
     def find_speed_delay(self) -> Amount:
-        """Delay of the speed behind its command [s]; see `_time_step`."""
-        return self._time_step(self.find_driven()[0], 0.0)
+        """Delay of the speed behind its command [s]; see `_time_steps`."""
+        return self._doubt_undriven(self._time_steps(self.find_driven()[0], 0.0), _AHEAD)
 
     def find_turn_delay(self) -> Amount:
         """Delay of the yaw rate behind its command [s], on the spot; on a car it is that of the steering."""
         if self.vehicle.kind == "ackermann":
-            return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.STEERING_LAG))
-        return self._time_step(0.0, self.find_driven()[1])
+            late = combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.STEERING_LAG))
+        else:
+            late = self._time_steps(0.0, self.find_driven()[1])
+        return self._doubt_undriven(late, _TURNING)
 
     def find_driven(self) -> tuple[float, float]:
         """Largest speed [m/s] and yaw rate [rad/s] of the runs of the fit, or else of the vehicle."""
         speed, turn = (max(self.list_driven(key), default=0.0) for key in (DRIVEN_SPEED, DRIVEN_TURN))
         return speed or self.vehicle.max_speed_mps or _USUAL_TOP[0], turn or _USUAL_TOP[1]
 
-    def _time_step(self, speed: float, turn: float) -> Amount:
+    def _doubt_undriven(self, late: Amount, motion: _Motion) -> Amount:
+        """A delay; in doubt where the runs of the fit hardly had the motion that is late.
+
+        It is then that of the other motion, which the model need not tell from it.
+        """
+        driven, floor = self.list_driven(motion.driven), self.file.fit.get("noise_floor")
+        noise = floor.get("velocity_rms") if isinstance(floor, Mapping) else None
+        rms = noise[motion.channel] if isinstance(noise, Sequence) and len(noise) > motion.channel else 0.0
+        if not late.is_known or not driven or not (isinstance(rms, float) and max(driven) < _DRIVEN * rms):
+            return late
+        who = "runs" if len(driven) > 1 else "run"
+        source = f"the {who} hardly {motion.did}: the delay is assumed equal to that of {motion.other}"
+        return replace(late, sources=(*late.sources, source), is_doubtful=True)
+
+    def _time_steps(self, speed: float, turn: float) -> Amount:
         """Time from a step of the command to 63 % of the motion that follows [s], from rest.
 
         It is that of the whole model: a dead time and a time constant add up, and so do motors and a ground
         that have none. Limits are left out: they are parameters of their own. Sources are the parameters on
-        which it depends. It is in doubt where it exceeds the time over which models are judged: a motion that
-        grows for so long does not follow its command by a delay.
+        which it depends, and the times after smaller steps where they differ. It is in doubt where they
+        differ much, and where it exceeds the time over which models are judged: a motion that grows for so
+        long does not follow its command by a delay.
         """
         dead = self.take(Quantity.COMMAND_DELAY)
         free = {
@@ -553,8 +595,8 @@ class Facts:
             and not is_of_one_run(effect.parameters)
         }
 
-        def time(effects: Mapping[str, Effect]) -> float:
-            moved = predict_step(self.vehicle, tuple(effects.values()), speed, turn, STEADY_S)
+        def time(effects: Mapping[str, Effect], part: float = 1.0) -> float:
+            moved = predict_step(self.vehicle, (*effects.values(),), part * speed, part * turn, STEADY_S)
             motion = moved.w if turn else moved.x
             return time_rise(motion / motion[-1]) if motion[-1] else math.nan
 
@@ -571,8 +613,22 @@ class Facts:
                 is_doubtful |= bool(self.file.find_number(effect, parameter).doubt)
         if not sources:
             return Amount(math.nan)
-        step = f"{turn:.3g} rad/s" if turn else f"{speed:.3g} m/s"
-        sources.append(f"time to 63 % of the motion after a step of {step}")
+        size, unit = (turn, "rad/s") if turn else (speed, "m/s")
+        # A smaller step may move nothing: then nothing is late.
+        times = {part * size: dead.value + time(free, part) for part in _STEPS}
+        known = {step: late for step, late in times.items() if math.isfinite(late)}
+        apart = max(known.values()) - min(known.values()) if known else 0.0
+        text = "time to 63 % of the motion"
+        if apart <= _UNCHANGED_S:
+            sources.append(f"{text} after a step of {size:.3g} {unit}")
+        else:
+            each = ", ".join(
+                f"{late:.2g} s after a step of {step:.3g} {unit}" for step, late in known.items()
+            )
+            sources.append(f"{text} from rest: {each}")
+        if apart > max((_ONE_DELAY - 1.0) * min(known.values(), default=0.0), _MPPI_STEP_S):
+            sources.append("one delay does not fit these steps")
+            is_doubtful = True
         if rise > HORIZON_S:
             sources.append(f"no delay describes a motion that grows for more than {HORIZON_S:g} s")
             is_doubtful = True

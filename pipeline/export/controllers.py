@@ -37,6 +37,20 @@ _FOLLOW = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"
 _PURSUIT = "regulated pure pursuit"
 
+
+def _presuppose(facts: Facts, table: ParameterTable) -> None:
+    """Say which corrections of the base's controller the limits presuppose: they are those of the body."""
+    used = {line for setting in table.settings for line in setting.sources}
+    gains = (Quantity.TRACK, Quantity.WHEELBASE, Quantity.RADIUS)
+    given = [amount for amount in map(facts.take, gains) if used.intersection(amount.sources)]
+    names = sorted({name for amount in given for name in amount.effects})
+    if names:
+        table.head.append(
+            "Limits and deadbands are of the body: as commands they hold only once the controller of the "
+            f"base is corrected for {' and '.join(names)}: slip model export MODEL --to ros2_control."
+        )
+
+
 NAV2 = Target(
     "nav2",
     "parameters of Nav2's MPPI, regulated pure pursuit and velocity smoother",
@@ -80,6 +94,7 @@ NAV2 = Target(
             f"{_FOLLOW}.ackermann.min_turning_r", "turning_radius", "MPPI with motion_model: ackermann", _CAR
         ),
     ),
+    _presuppose,
 )
 
 _DIFF = "diff_drive_controller.ros__parameters"

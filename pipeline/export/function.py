@@ -61,19 +61,18 @@ def write_function(model: Model) -> str:
     """
     vehicle = model.vehicle
     steps = [(effect.place, _write_step(effect, vehicle)) for effect in model if effect.place in _PLACES]
-    parts = [_write_head(model, [name for _, step in steps for name in step.state])]
+    names = [name for _, step in steps for name in step.state]
+    parts = [_write_head(model, names)]
     for stage in _PLACES:
         if stage is Place.KINEMATICS:
             parts.append(_roll(vehicle.kind))
         if stage is Place.BODY:
-            parts.append("\n        v_x, v_y, v_w = v0, s0, w0")
-        parts += [
-            f"\n        {line}" for owner, one in steps if owner is stage for line in one.step.splitlines()
-        ]
+            parts.append("\n    v_x, v_y, v_w = v0, s0, w0")
+        parts += [f"\n    {line}" for owner, one in steps if owner is stage for line in one.step.splitlines()]
     lever_m = vehicle.kinematics.lever_m(vehicle)
     if lever_m:
-        parts.append(f"\n        v_y = v_y + {lever_m!r} * v_w")
-    return "".join([*parts, _TAIL])
+        parts.append(f"\n    v_y = v_y + {lever_m!r} * v_w")
+    return "".join([*parts, _TAIL.replace("{returned}", "".join(f", {name}" for name in names))])
 
 
 def _write_file(file: ModelFile) -> str:
@@ -91,7 +90,7 @@ def _write_step(effect: Effect, vehicle: Vehicle) -> _Step:
         return _Step(_fill(known.step, effect), known.state)
     writers: dict[type[Effect], Callable[[Any], _Step]] = {
         FormulaEffect: _write_formula,
-        Delay: lambda _effect: _Step(""),  # the function reads commands with this delay
+        Delay: lambda _effect: _Step(""),  # commands act with this delay
         Lag: _write_lag,
         Ramp: _write_ramp,
     }
@@ -185,7 +184,7 @@ def _write_ramp(effect: Ramp) -> _Step:
     return _Step(text, (state,))
 
 
-def _write_head(model: Model, state: list[str]) -> str:
+def _write_head(model: Model, names: list[str]) -> str:
     vehicle, text = model.vehicle, _HEAD
     delay = math.fsum(effect.delay for effect in model if isinstance(effect, Delay))
     unknown = vehicle.format_unknown()
@@ -198,7 +197,8 @@ def _write_head(model: Model, state: list[str]) -> str:
         ("delay", delay),
     ):
         text = text.replace(f"{{{key}}}", _number(number))
-    text = text.replace("{state}", "".join(f"\n    {name} = 0.0" for name in state))
+    text = text.replace("{zeros}", f" + (0.0,) * {len(names)}" if names else "")
+    text = text.replace("{names}", f"\n    ({', '.join(names)},) = state[7:]" if names else "")
     moves_sideways = vehicle.kinematics.has_inputs("sideways")
     text = text.replace("{third}", "0.0, aside" if moves_sideways else "aside, 0.0")
     # The name comes last, so that its text is not searched for further placeholders.
@@ -208,10 +208,10 @@ def _write_head(model: Model, state: list[str]) -> str:
 def _roll(kind: str) -> str:
     turning = "f_x * math.tan(steering) / WHEELBASE" if kind == "ackermann" else "R * (right - left) / B"
     return f"""
-        turning = 1.0 if R * (max(abs(left), abs(right)) + abs(sideways)) > 0.01 else 0.0
-        f_x = R * (left + right) / 2.0
-        f_w = {turning}
-        v0, s0, w0 = f_x, R * sideways, f_w"""
+    turning = 1.0 if R * (max(abs(left), abs(right)) + abs(sideways)) > 0.01 else 0.0
+    f_x = R * (left + right) / 2.0
+    f_w = {turning}
+    v0, s0, w0 = f_x, R * sideways, f_w"""
 
 
 def _number(value: float) -> str:

@@ -21,7 +21,7 @@ from pipeline.datasets import ModelFit
 from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
-from pipeline.estimation.transfer import Transfer, describe_beyond
+from pipeline.estimation.transfer import Transfer, describe_beyond, describe_remaining
 from pipeline.models import Number
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, format_rises
 from pipeline.run import MotionRun
@@ -253,7 +253,7 @@ def format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
         lines.append(format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
         lines.append(format_measured_errors(f"  {Path(name).name} as given", item.carried.pooled))
         lines.append(format_measured_errors("  refitted to this run", item.own.pooled))
-        ratios = [f"{ratio:.2f} in {name}" for name, ratio in item.apart.items()] or [f"{item.ratio:.2f}"]
-        lines.append(f"  error as given over error refitted: {', '.join(ratios)}")
+        lines.append(f"  {describe_remaining(item.remaining)}")
+        lines += [f"  fitted anew, as of the recording: {', '.join(item.renewed)}"] if item.renewed else []
         lines += [f"  {describe_beyond(item.beyond)}"] if item.beyond else []
     return lines

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.estimation.plausibility import is_exceeded, is_nameable, list_implausible
+from pipeline.estimation.plausibility import explain_impossible, is_exceeded, is_nameable, list_implausible
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
 
@@ -24,6 +25,32 @@ def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None
     assert is_exceeded(limit, replace(_CONDITIONS, exceeded={of: 3.2}))
     assert not is_exceeded(limit, replace(_CONDITIONS, exceeded={of: 3.1}))
     assert not is_exceeded(limit, replace(_CONDITIONS, exceeded={"another": 9.0}))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "exceeded", "said"),
+    [
+        (
+            "body_turn_limit",
+            {"limit": 0.38},
+            {"turn": 0.631},
+            "limit = 0.38 rad/s .* wheels reach 0.631 rad/s",
+        ),
+        ("lateral_skid", {"c": -0.05}, {}, "c = -0.05 s is not possible: it must be above 0 s"),
+        ("effective_track", {"k": 6.0}, {}, r"k = 6 is not possible: vehicles have [\d.]+ to [\d.]+"),
+        (
+            "body_turn_limit",
+            {"limit": 0.01},
+            {},
+            "limit = 0.01 rad/s .* at the end of its range, 0.01 rad/s to",
+        ),
+    ],
+)
+def test_a_value_that_is_not_possible_is_named_with_what_it_contradicts(
+    name: str, values: dict[str, float], exceeded: dict[str, float], said: str
+) -> None:
+    told = explain_impossible(find_effect(name)(**values), replace(_CONDITIONS, exceeded=exceeded))
+    assert re.match(said, told), told
 
 
 def test_what_is_too_small_or_another_in_disguise_is_not_named() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation import EstimationData, Input
+from pipeline.estimation import EstimationData, Input, decision
 from pipeline.estimation.additions import Tries, explain_refusals
 from pipeline.estimation.ladder import judge_whole
 from pipeline.models import Model, find_effect
@@ -38,6 +38,15 @@ def test_what_is_there_is_accepted_and_what_is_not_is_refused(data: EstimationDa
     refused = explain(data, track, lag, find_effect("wheel_radius")(k=1.05))
     assert list(refused) == ["wheel_radius"]
     assert "required 5" in refused["wheel_radius"]
+
+
+def test_a_fall_that_is_too_small_says_of_which_error(
+    data: EstimationData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decision, "SHOWN", 1.0)
+    refused = explain(data, find_effect("effective_track")(k=1.4), find_effect("drive_lag")(tau=0.3))
+    for name, target in {"effective_track": "the poses", "drive_lag": "the measured wheels"}.items():
+        assert refused[name].startswith(f"no error against {target} falls by more than ")
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import random
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.estimation import Input
 from pipeline.estimation.run_residuals import RunResiduals
+from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, format_model, list_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
@@ -229,3 +231,27 @@ def test_a_model_file_says_again_what_it_was_told(
     assert read.values[name] == pytest.approx(value, rel=1e-5)
     assert format_model(again) == text
     assert tomllib.loads(text)["format"] == 1
+
+
+def test_a_controller_advances_the_exported_state_by_commands_that_it_tries() -> None:
+    effects = (
+        find_effect("transport_delay")(d=0.1),
+        find_effect("drive_lag")(tau=0.3),
+        find_effect("effective_track")(k=1.6),
+        find_effect("drive_overshoot")(tau=0.2, damping=0.5),
+    )
+    file, space = ModelFile(Model(HUSKY, effects)), dict[str, Any]()
+    exec(compile(export_model(file, "python"), "exported", "exec"), space)  # noqa: S102 - that is what it is for
+    advance, late = space["advance"], space["DELAY"]
+    assert late == 0.1
+    state, tried = space["REST"], []
+    for number in range(100):
+        before = state
+        tried.append(advance(state, (-3.0, 5.0), 0.01))
+        assert state == before
+        state = advance(state, (5.0, 3.0) if number < 50 else (2.0, 4.0), 0.01)
+    rows = predict(file, [(-late, 5.0, 3.0), (0.5 - late, 2.0, 4.0)], 1.0, step_s=0.01)
+    assert state[:7] == pytest.approx(rows[-1], abs=1e-9)
+    # From a moving state another command begins with the velocity that the vehicle has.
+    assert tried[60][4] != pytest.approx(tried[0][4], abs=0.1)
+    assert tried[60][4] == pytest.approx(rows[59][4], abs=0.1)

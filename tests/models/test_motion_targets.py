@@ -264,6 +264,54 @@ def test_a_parameter_that_no_effect_tells_is_named_as_one_that_is_not_written() 
     assert "vx_max" not in unknown.partition("controller_server:")[2]
 
 
+def test_a_length_alone_makes_no_deadband() -> None:
+    text = export_model(make(find_effect("wheel_radius")(k=0.93)), "nav2")
+    _, _, unknown = text.partition("Not written, as no effect of the model determines it:")
+    assert "VelocityDeadbandCritic.deadband_velocities" in unknown
+    assert "deadband_velocities:" not in text
+
+
+@pytest.mark.parametrize(("turned", "drove"), [(0.108, 1.97), (0.9, 0.05)])
+def test_the_delay_of_a_motion_that_was_hardly_driven_is_in_doubt(turned: float, drove: float) -> None:
+    run = {**FIT["runs"][0], "driven_speed_mps": drove, "driven_yaw_rate_radps": turned}  # type: ignore[index]
+    fit = {**FIT, "runs": [run], "noise_floor": {"velocity_rms": [0.036, 0.035, 0.038]}}
+    delay, ends = find_effect("transport_delay")(d=0.29), {"transport_delay.d": (0.26, 0.32)}
+    text = export_model(make(delay, fit=fit, intervals=ends), "nav2")
+    hardly_turned = turned < drove
+    known, assumed = ("vx", "wz") if hardly_turned else ("wz", "vx")
+    assert f"\n      model_delay_{known}: 0.29" in text
+    assert f"\n      # model_delay_{assumed}: 0.29" in text
+    said = ("turned", "driving") if hardly_turned else ("drove ahead", "turning")
+    assert text.count(f"# the run hardly {said[0]}: the delay is assumed equal to that of {said[1]}") == 1
+    assert "# What depends on a value in doubt is commented out." in text
+
+
+def test_a_delay_that_depends_on_the_step_is_told_by_step() -> None:
+    servo = find_effect("wheel_servo")(tau=0.2, bound=1.5, no_load=4.0, scrub=1.2, reset=0.35)
+    fit = {**FIT, "runs": [{**FIT["runs"][0], "driven_speed_mps": 2.0, "driven_yaw_rate_radps": 3.0}]}  # type: ignore[index]
+    ends = {f"wheel_servo.{name}": (0.9 * value, 1.1 * value) for name, value in servo.values.items()}
+    text = export_model(make(servo, fit=fit, intervals=ends), "nav2")
+    above, _, _ = text.partition("model_delay_wz")
+    told = re.findall(r"([\d.]+) s after a step of ([\d.]+) rad/s", above)
+    assert [float(step) for _, step in told] == [3.0, 1.5, 0.75]
+    for late, step in told:
+        motion = predict_step(HUSKY, (servo,), 0.0, float(step), 20.0).w  # type: ignore[arg-type]
+        true = np.flatnonzero(motion >= 0.632 * motion[-1])[0] * 0.02
+        assert float(late) == pytest.approx(true, abs=0.02, rel=0.05)
+    lates = [float(late) for late, _ in told]
+    assert max(lates) > 1.5 * min(lates)
+    assert "# one delay does not fit these steps" in above
+    assert "\n      # model_delay_wz: " in text
+
+
+def test_limits_of_the_body_name_the_correction_that_they_presuppose() -> None:
+    limit, track = find_effect("body_turn_limit")(limit=0.63), find_effect("effective_track")(k=1.7)
+    said = "is corrected for effective_track: slip model export MODEL --to ros2_control."
+    assert said in export_model(make(limit, track), "nav2")
+    assert "is corrected for" not in export_model(make(limit), "nav2")
+    assert "is corrected for" not in export_model(make(track), "nav2")
+
+
 @pytest.mark.parametrize("dead_s", [0.0, 0.1])
 def test_mppi_is_told_the_step_response_that_the_motors_have(dead_s: float) -> None:
     # Its time constant is that of a motor without load: on the ground it is later, most of all in a turn.
@@ -272,13 +320,15 @@ def test_mppi_is_told_the_step_response_that_the_motors_have(dead_s: float) -> N
     ends = {f"wheel_servo.{name}": (0.9 * value, 1.1 * value) for name, value in servo.values.items()}
     ends["transport_delay.d"] = (0.09, 0.11)
     delay = find_effect("transport_delay")(d=dead_s)
-    p = take("nav2", make(servo, delay, fit=fit, intervals=ends))
+    text = export_model(make(servo, delay, fit=fit, intervals=ends), "nav2")
+    told = re.findall(r"model_delay_(vx|wz): ([\d.]+)", text)
+    p = {axis: float(value) for axis, value in told}
     for axis, asked in (("vx", (2.0, 0.0)), ("wz", (0.0, 3.0))):
         moved = predict_step(HUSKY, (servo,), *asked, 20.0)  # type: ignore[arg-type]
         motion = moved.w if asked[1] else moved.x
         late = np.flatnonzero(motion >= 0.632 * motion[-1])[0] * 0.02
         assert late > 0.2
-        assert p[f"FollowPath.model_delay_{axis}"] == pytest.approx(dead_s + late, abs=0.02)
+        assert p[axis] == pytest.approx(dead_s + late, abs=0.02)
 
 
 def test_a_motion_that_grows_slowly_is_no_delay() -> None:

@@ -6,6 +6,7 @@ import yaml
 from exported_files import predict
 from motion_runs import QUIET, simulate, vehicle_of
 
+from pipeline.core import format_share
 from pipeline.estimation import EstimationData, Input, carry_over, fit_model
 from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, export_model
@@ -44,9 +45,38 @@ def test_what_fails_and_faster_driving_than_in_the_fit_are_told_apart() -> None:
     assert said in item.warning
     lines = format_transfers([("tile.toml", item)])
     assert f"  {said}" in lines
-    assert any(f"{item.apart['heading']:.2f} in heading" in line for line in lines)
-    # The heading alone, where the position is as good as with a fit to the run.
-    assert ("in heading alone" in item.warning) == (item.apart["position"] <= 1.1)
+    given, own = item.remaining["heading"]
+    assert given - own > 0.1
+    assert any(f"{format_share(given)} in heading" in line for line in lines)
+    # The heading alone, where the position is nearly as good as with a fit to the run.
+    given, own = item.remaining["position"]
+    assert ("in heading alone" in item.warning) == (given - own <= 0.1)
+
+
+def test_twice_an_error_that_is_nearly_none_is_no_failure() -> None:
+    true, other = (simulate(TILE, seed=n, disturbance=Disturbance()) for n in (1, 2))
+    data = EstimationData([true], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, Model(HUSKY, tuple(find_effect(name)() for name in TILE)))
+    near = fitted.model.change("effective_track", k=1.01 * TILE["effective_track"])
+    (item,) = carry_over(near, [other], Input.MEASURED)
+    given, own = item.remaining["heading"]
+    assert item.apart["heading"] > 1.5
+    assert given - own < 0.1
+    assert item.warning == ""
+
+
+def test_the_clock_of_another_recording_is_fitted_anew() -> None:
+    first, second = (
+        simulate({**TILE, "clock_offset": late}, seed=n, imu=None) for n, late in ((1, 0.25), (2, 0.1))
+    )
+    effects = [find_effect(name)() for name in (*TILE, "clock_offset")]
+    data = EstimationData([first], HUSKY, Input.MEASURED)
+    fitted = fit_model(data, Model(HUSKY, tuple(effects)))
+    (item,) = carry_over(fitted.model, [second], Input.MEASURED)
+    assert item.renewed == ["clock_offset.d"]
+    assert item.warning == ""
+    assert max(item.apart.values()) < 1.1
+    assert "  fitted anew, as of the recording: clock_offset.d" in format_transfers([("m", item)])
 
 
 def typical_model(kind: str) -> Model:
