@@ -356,7 +356,7 @@ def test_a_tape_and_turns_tell_radius_and_track(
         assert value == pytest.approx(length, rel=0.01)
         assert low < length < high
         assert f"{name} = " in format_finding(found)
-    with pytest.raises(SlipError, match=r"by hand, \[vehicle\] wheel_radius_m = .*; track_width_m = "):
+    with pytest.raises(SlipError, match=r"by hand, vehicle = \{wheel_radius_m = .*, track_width_m = .*\} in"):
         set_up_log(log, Options(out=tmp_path))
 
 
@@ -397,6 +397,43 @@ def test_a_tape_that_contradicts_the_vehicle_offers_no_length(samples: Path, tmp
     assert "wheel_radius_m" not in found.values
     said = format_finding(found)
     assert re.search(r"contradicts the .*Husky.* times as far in this log\. No length is taken", said), said
+
+
+def test_a_tape_that_contradicts_the_poses_offers_no_length(tmp_path: Path) -> None:
+    options = Options(out=tmp_path, overrides={"truth": {"distance_m": 2.0}})
+    findings = set_up_log(write_log(tmp_path / "log.mcap", draw(51)), options).choice.findings
+    said = " ".join(format_finding(one) for one in findings)
+    assert re.search(r"contradicts the other signals: by .* times as far in this log\. No length", said), said
+    assert not any(one.id == "lengths_by_tape" for one in findings)
+
+
+@pytest.mark.parametrize(
+    ("back", "truth", "said", "hint"),
+    [
+        (2.0, {"distance_m": 2.0, "turns": 10.0}, "forward and back", "drove forward and back"),
+        (1.96, {"distance_m": 2.0}, "50 % of the way|49 % of the way", "measures one way"),
+        (0.0, {"distance_m": 100.0, "turns": 10.0}, "which no vehicle has", "that no vehicle has"),
+        (0.0, {"turns": 10.0}, "wheel radius is not known", "give --wheel-radius, or --drove"),
+    ],
+)
+def test_what_is_measured_by_hand_is_refused_where_it_shows_no_length(
+    back: float, truth: dict[str, float], said: str, hint: str, tmp_path: Path
+) -> None:
+    radius, track = 0.0825, 0.45
+    still, second = np.zeros(round(2.0 / STEP)), round(1.0 / STEP)
+    ways = [np.full(8 * second, 2.0 / radius / 8.0), np.full(8 * second, -back / radius / 8.0)]
+    spin = np.full(40 * second, 10.0 * np.pi * track / radius / 40.0)
+    left, right = (
+        np.concatenate([still, ways[0], still, ways[1], still, side * spin, still]) for side in (-1.0, 1.0)
+    )
+    log = drive_by_hand(tmp_path / "log.mcap", left, right, None)
+    options = Options(out=tmp_path, overrides={"truth": truth})
+    (found,) = [one for one in inspect_log(log, options).notes if one.id == "no_length_by_tape"]
+    assert re.search(said, format_finding(found)), format_finding(found)
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, options)
+    assert hint in refused.value.hint
+    assert "wheel_radius_m =" not in refused.value.hint
 
 
 @pytest.mark.parametrize(("spoilt", "share"), [("command", 0.55), ("command", 0.4), ("wheels", 0.55)])
