@@ -436,6 +436,98 @@ def test_what_is_measured_by_hand_is_refused_where_it_shows_no_length(
     assert "wheel_radius_m =" not in refused.value.hint
 
 
+def numbered(path: Path, drive: Drive) -> Path:
+    """Four wheels whose names do not say their side: 1 and 4 are left."""
+    pair = sides(drive).inputs
+    joints = {f"wheel_{number}": pair[side] for number, side in zip(range(1, 5), (0, 1, 1, 0), strict=True)}
+    return write_log(path, drive, joints=joints)
+
+
+def upside_down(path: Path, drive: Drive) -> Path:
+    return write_log(path, drive, gyro=-drive.rate)
+
+
+CONFIGURED = [
+    (write_log, {"command": {"yaw_unit": "deg/s"}}, 'yaw_unit = "deg/s"', ""),
+    (upside_down, {"imu": {"unit": "deg/s"}}, 'unit = "deg/s"', ""),
+    (write_log, {"wheels": {"factors": {"left": 0.5}}}, 'factors = {"left" = 0.5}', ""),
+    (
+        numbered,
+        {"wheels": {"left": ["wheel_1", "wheel_2"], "right": ["wheel_3", "wheel_4"]}},
+        'right = ["wheel_3", "wheel_4"]',
+        'left = ["wheel_1", "wheel_4"]',
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "given", "said", "instead"), CONFIGURED)
+def test_a_line_that_the_log_contradicts_is_named(
+    make: Callable[[Path, Drive], Path],
+    given: dict[str, object],
+    said: str,
+    instead: str,
+    tmp_path: Path,
+) -> None:
+    findings = set_up_log(
+        make(tmp_path / "log.mcap", draw(51)), Options(out=tmp_path, overrides=given)
+    ).choice.findings
+    (error,) = [format_finding(one) for one in findings if one.severity == "error"]
+    assert "contradicts the other signals" in error
+    assert said in error
+    assert instead in error
+
+
+@pytest.mark.parametrize(
+    ("make", "given"),
+    [
+        (write_log, {"command": {"yaw_unit": "rad/s"}}),
+        (upside_down, {"imu": {"unit": "rad/s"}}),
+        (numbered, {"wheels": {"left": ["wheel_1", "wheel_4"], "right": ["wheel_2", "wheel_3"]}}),
+    ],
+)
+def test_a_line_that_is_right_is_obeyed(
+    make: Callable[[Path, Drive], Path], given: dict[str, object], tmp_path: Path
+) -> None:
+    options = Options(out=tmp_path, overrides=given)
+    setup = set_up_log(make(tmp_path / "log.mcap", draw(51)), options)
+    assert not {one.id for one in setup.choice.findings} & {"configured_wrongly", "kept_as_recorded"}
+
+
+@pytest.mark.parametrize(
+    ("make", "given"),
+    [
+        (turned_and_in_degrees, {"command": {"yaw_unit": "rad/s"}}),
+        (with_a_gyro_in_degrees, {"imu": {"unit": "rad/s"}}),
+    ],
+)
+def test_a_unit_that_keeps_a_log_as_recorded_is_obeyed_and_told(
+    make: Callable[[Path, Drive], Path], given: dict[str, object], tmp_path: Path
+) -> None:
+    options = Options(out=tmp_path, overrides=given)
+    setup = set_up_log(make(tmp_path / "log.mcap", draw(51)), options)
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "kept_as_recorded"]
+    assert any('unit = "rad/s", and it is taken as it is recorded' in one for one in told)
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"left": ["wheel_1", "wheel_5"], "right": ["wheel_2"]}, "left under [wheels] names wheel_5"),
+        ({"left": ["wheel1"], "right": ["wheel2"]}, "left under [wheels] names wheel1"),
+        ({"factors": {"wheel_9": 0.5}}, "factors under [wheels] names wheel_9"),
+    ],
+)
+def test_a_joint_that_is_not_there_is_refused_with_those_that_are(
+    given: dict[str, object], what: str, tmp_path: Path
+) -> None:
+    log = numbered(tmp_path / "log.mcap", draw(51))
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, Options(out=tmp_path, overrides={"wheels": given}))
+    assert refused.value.code == "joint_unknown"
+    assert what in refused.value.what
+    assert "wheel_1, wheel_2, wheel_3 and wheel_4" in refused.value.hint
+
+
 @pytest.mark.parametrize(("spoilt", "share"), [("command", 0.55), ("command", 0.4), ("wheels", 0.55)])
 def test_a_correction_that_a_part_of_a_drive_denies_is_not_applied(
     spoilt: str, share: float, tmp_path: Path
