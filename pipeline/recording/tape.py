@@ -55,13 +55,14 @@ def measure_by_tape(
     is_one_way = net > _ONE_WAY * way
     moved = net if is_one_way else way
     taped = truth.distance_m / moved if truth.distance_m and moved > 0.0 else None
-    source: dict[str, object] = {"source": reading.name}
+    source = reading.name
     # Of a drive that turns back a tape may have measured half.
-    contradiction = _contradict(taped, known, choice, most=_FAR if is_one_way else 2.0 * _FAR)
+    contradiction = _contradict(source, taped, known, choice, most=_FAR if is_one_way else 2.0 * _FAR)
     if contradiction:
-        return [Finding("tape_contradicts_vehicle", "warning", "vehicle", {**source, **contradiction})]
+        return contradiction
     if taped and not is_one_way:
-        return [_refuse({**source, "kind": "both ways", "share": 0.5 * (1.0 - net / way)})]
+        turned_back = {"kind": "both ways", "source": source, "share": 0.5 * (1.0 - net / way)}
+        return [Finding("no_length_by_tape", "warning", "vehicle", turned_back)]
     share = _share(truth.distance_m) if truth.distance_m and taped else 0.0
     values = {"ahead" if is_gain else "wheel_radius_m": _bound(taped, share)} if taped else {}
     turns, turns_share = _count_turns(truth, gyro)
@@ -74,8 +75,8 @@ def measure_by_tape(
                 radius * turning / angle, turns_share + (share if taped else 0.0)
             )
         elif truth.turns:
-            return [_refuse({**source, "kind": "no radius"})]
-    return _show_lengths({**source, "kind": reading.form}, values)
+            return [Finding("no_length_by_tape", "warning", "vehicle", {"kind": "no radius"})]
+    return _show_lengths(reading, values)
 
 
 def _count_turns(truth: TruthSection, gyro: Held) -> tuple[float, float]:
@@ -96,20 +97,17 @@ def _find_radius(configuration: Configuration, choice: Choice | None) -> float |
     return configuration.vehicle.wheel_radius_m if is_open else choice.vehicle.wheel_radius_m
 
 
-def _show_lengths(about: Mapping[str, object], values: Mapping[str, Sequence[float]]) -> list[Finding]:
+def _show_lengths(reading: Reading, values: Mapping[str, Sequence[float]]) -> list[Finding]:
     """Lengths and gains with their line of run.toml, or that one is of no vehicle; nothing without any."""
     for key, (least, most) in {"wheel_radius_m": RADII_M, "track_width_m": RANGES["track_width_m"]}.items():
         if key in values and not least <= values[key][0] <= most:
-            doubt = {"key": key, "value": values[key][0], "least": least, "most": most}
-            return [_refuse({**about, "kind": "no vehicle", **doubt})]
+            doubt: dict[str, object] = {"kind": "no vehicle", "source": reading.name, "key": key}
+            doubt |= {"value": values[key][0], "least": least, "most": most}
+            return [Finding("no_length_by_tape", "warning", "vehicle", doubt)]
     lengths = {key: float(f"{one[0]:.4g}") for key, one in values.items() if key.endswith("_m")}
     line = format_section("vehicle", starmap(format_line, lengths.items())) if lengths else ""
-    shown = Finding("lengths_by_tape", "warning", "vehicle", {**about, **values, "line": line})
-    return [shown] if values else []
-
-
-def _refuse(values: Mapping[str, object]) -> Finding:
-    return Finding("no_length_by_tape", "warning", "vehicle", values)
+    said = {"source": reading.name, "kind": reading.form, **values, "line": line}
+    return [Finding("lengths_by_tape", "warning", "vehicle", said)] if values else []
 
 
 def _read(index: LogIndex, configuration: Configuration, choice: Choice | None) -> tuple[Reading, Held, bool]:
@@ -135,27 +133,32 @@ def _read(index: LogIndex, configuration: Configuration, choice: Choice | None) 
 
 
 def _contradict(
-    taped: float | None, known: float | None, choice: Choice | None, most: float
-) -> dict[str, object]:
+    source: str, taped: float | None, known: float | None, choice: Choice | None, most: float
+) -> list[Finding]:
     """How a tape contradicts the vehicle or the motion that the log shows; empty where it does not.
 
     Args:
+        source: what turned, or was commanded.
         taped: wheel radius [m], or gain of speeds, by the tape.
         known: the same by the vehicle; None if it is not known.
         choice: topics of the log; None takes them by their names.
         most: ratio of both from which on they contradict each other.
     """
     if choice is None or not taped or not known:
-        return {}
+        return []
     is_named = choice.vehicle_source != "fitted" and not choice.vehicle.stand_ins
     pose = choice.sources.pose
     # Speeds of a log without any other reference have the unit that the tape gives them.
     is_open = known == 1.0 and not is_named and (pose is None or pose.wheels is not None)
     if is_open or 1.0 / most < taped / known < most:
-        return {}
-    said = {"kind": "vehicle" if is_named else "signals", "vehicle": choice.vehicle.name}
-    radius = {} if known == 1.0 else {"radius_m": known}
-    return {**said, **radius, "value": known / taped}
+        return []
+    said: dict[str, object] = {
+        "is_named": is_named,
+        "source": source,
+        "vehicle": choice.vehicle.name,
+    }
+    said |= {"value": known / taped} | ({} if known == 1.0 else {"radius_m": known})
+    return [Finding("tape_contradicts_vehicle", "warning", "vehicle", said)]
 
 
 def add_lengths(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:

@@ -653,7 +653,7 @@ def _command_not_scaled(of: Values) -> str:
 
 def _tape_contradicts(of: Values) -> str:
     radius = f" and a wheel radius of {of['radius_m']:.4g} m" if "radius_m" in of else ""
-    known = f"the {of['vehicle']}" if of["kind"] == "vehicle" else "the other signals"
+    known = f"the {of['vehicle']}" if of["is_named"] else "the other signals"
     return (
         f"the distance that was measured by hand contradicts {known}: by {of['source']}{radius} it drove "
         f"{of['value']:.3g} times as far in this log. No length is taken from it: measure all that the log "
