@@ -1214,6 +1214,12 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         "by {value:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them",
     },
+    "wheelbase_contradicted": "[vehicle] in run.toml gives wheelbase_m = {given:g}, but by commands and "
+    "poses the vehicle turns as one with a wheelbase of {value:.3g} m ({low:.3g} to {high:.3g} m): check the "
+    "line, and the unit of the steering angle",
+    "late_as_configured": "the motion follows {source} {value:.2f} s after its stamps, and {given} under "
+    "[command] in run.toml moves them by as much: without that line there is hardly a delay. Take it out, "
+    "unless the stamps are known to be late",
     "lengths_by_tape": _by_tape,
     "tape_contradicts_vehicle": _tape_contradicts,
     "no_length_by_tape": {

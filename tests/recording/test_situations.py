@@ -528,6 +528,44 @@ def test_a_joint_that_is_not_there_is_refused_with_those_that_are(
     assert "wheel_1, wheel_2, wheel_3 and wheel_4" in refused.value.hint
 
 
+def test_a_number_that_an_array_does_not_have_is_refused(tmp_path: Path) -> None:
+    log = numbered(tmp_path / "log.mcap", draw(51))
+    sections = {side: f"/joint_states.velocity[{at}]" for side, at in (("left_topic", 0), ("right_topic", 4))}
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, Options(out=tmp_path, overrides={"wheels": sections}))
+    assert refused.value.code == "element_not_found"
+    assert "velocity of /joint_states has 4 numbers" in refused.value.what
+    assert "the last one is velocity[3]" in refused.value.hint
+
+
+@pytest.mark.parametrize(("late_s", "is_told"), [(0.5, True), (0.01, False), (-1.0, False)])
+def test_a_delay_that_a_configured_time_makes_is_told(
+    late_s: float,
+    is_told: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    options = Options(out=tmp_path, overrides={"command": {"late_s": late_s}})
+    found = set_up_log(write_log(tmp_path / "log.mcap", draw(51)), options).choice.findings
+    told = [format_finding(one) for one in found if one.id == "late_as_configured"]
+    assert len(told) == is_told
+    assert all("late_s = 0.5 under [command]" in one for one in told)
+
+
+@pytest.mark.parametrize(("wheelbase", "is_told"), [(13.0, True), (1.3, False)])
+def test_a_wheelbase_by_which_a_car_does_not_turn_is_told(
+    wheelbase: float,
+    is_told: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    drive = draw(51)
+    speed = np.maximum(drive.asked[:, 0], 0.2)
+    car = np.column_stack([speed, np.arctan(drive.asked[:, 1] / speed)])
+    options = Options(out=tmp_path, overrides={"vehicle": {"kind": "ackermann", "wheelbase_m": wheelbase}})
+    setup = set_up_log(write_log(tmp_path / "log.mcap", drive, car=car), options)
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "wheelbase_contradicted"]
+    assert len(told) == is_told, setup.choice.recording.geometry
+
+
 @pytest.mark.parametrize(("spoilt", "share"), [("command", 0.55), ("command", 0.4), ("wheels", 0.55)])
 def test_a_correction_that_a_part_of_a_drive_denies_is_not_applied(
     spoilt: str, share: float, tmp_path: Path
