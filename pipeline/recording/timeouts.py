@@ -420,7 +420,7 @@ def ask_delay(case: Case) -> Case:
     command, is_driven = case.command, case.driven.is_known
     given = case.configuration.command.late_s
     if not command.is_sure or given is not None:
-        seen = command.reading.explained.lag + command.reading.explained.delay
+        seen = command.reading.explained.delay
         # Stamps that were not late are early by what is taken off them.
         if command.is_sure and given and abs(given) > _ERROR_S and abs(seen / given - 1.0) < _AS_MUCH:
             values = {"source": str(command.source), "value": seen, "given": format_line("late_s", given)}
