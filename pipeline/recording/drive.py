@@ -118,6 +118,13 @@ def is_of_wheels(columns: TopicColumns, drive: Drive) -> Flags:
     return np.isin(kinds, kinds[read])
 
 
+def list_joints(columns: TopicColumns) -> tuple[str, ...]:
+    """Names of the joints that messages of a topic hold; none of a type without names."""
+    joints = find_type(columns.type_name).joints
+    names = None if joints is None else columns.fields.get(joints.names)
+    return tuple(names.values) if isinstance(names, RaggedStrings) else ()
+
+
 def _find_factor(section: DriveSection, side: str, joint: str = "") -> float:
     """Factor on the recorded speeds of a side, or of a joint of it, by its own scale and sign."""
     factors = section.factors or {}

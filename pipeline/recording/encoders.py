@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from pipeline.core import Floats
+from pipeline.core import Floats, format_line
 from pipeline.recording.case import Case, is_crossed
 from pipeline.recording.drive import choose_sides
 from pipeline.recording.findings import Finding
@@ -195,7 +195,8 @@ def ask_joints(case: Case) -> Case:
 def ask_scales(case: Case) -> Case:
     """Correct a side whose encoder counts on another scale than the other."""
     reading, made = case.wheels.reading, case.wheels.reading.explained
-    if reading.form != "sides" or not made.is_known or case.complete().wheels.factors is not None:
+    given = case.configuration.wheels.factors or {}
+    if reading.form != "sides" or not made.is_known or "factors" in case.changes.get("wheels", {}):
         return case
     sides = (reading.first, reading.second)
     left, right = (measure_wheel(one, case.motion, (made.lag, made.delay), sides) for one in sides)
@@ -209,12 +210,13 @@ def ask_scales(case: Case) -> Case:
         high, low = (abs(np.log(counts[one] * case.vehicle.wheel_radius_m)) for one in (side, other))
         side, other = (other, side) if low - high > 0.5 * abs(np.log(scale)) else (side, other)
     factor = float(f"{1.0 / snap(counts[side] / counts[other]):.4g}")
-    if not _explains_more(case, {side: factor}):
+    factors = {**given, side: factor * given.get(side, 1.0)}
+    if not _explains_more(case, factors):
         return case
     values = {"side": side, "other": other, "factor": factor}
-    line = f"factors = {{{side} = {factor:g}}}"
-    case.correct("wheels", "side scale", values, line, {"factors": {side: factor}})
-    return case.read_again()
+    line = format_line("factors", factors)
+    is_corrected = case.correct("wheels", "side scale", values, line, {"factors": factors})
+    return case.read_again() if is_corrected else case
 
 
 def read_as_wheels(case: Case) -> Case:

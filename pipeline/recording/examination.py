@@ -1,15 +1,16 @@
 """Examination of a log: from the columns of its candidates to a `Recording`, by a list of questions."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import msgspec
 
-from pipeline.core import SlipError, format_line
+from pipeline.core import SlipError, format_line, name_first
 from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
+from pipeline.recording.drive import list_joints
 from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_as_wheels
-from pipeline.recording.evidence import equal_motion
+from pipeline.recording.evidence import RATES, equal_motion
 from pipeline.recording.extract import Given
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import Geometry, explain_wheels
@@ -20,7 +21,7 @@ from pipeline.recording.motion import CLEAR, FEWEST_STEPS
 from pipeline.recording.odometry import ask_odometry
 from pipeline.recording.outages import ask_outages
 from pipeline.recording.publishers import ask_publishers, ask_tracks
-from pipeline.recording.readings import Reading
+from pipeline.recording.readings import SIDES, Reading
 from pipeline.recording.roles import (
     ask_angle,
     ask_kind,
@@ -38,6 +39,8 @@ from pipeline.run import GROUND_UNOBSERVABLE, Alignment
 from pipeline.sources import (
     RADII_M,
     Configuration,
+    ConfigurationError,
+    DriveForm,
     DriveSource,
     PoseContent,
     PoseSource,
@@ -82,6 +85,7 @@ class Recording:
         alignment: corrections of the command; None where nothing shows them.
         is_still: whether the body hardly moves where the drive does.
         refused: why the poses say nothing, and nothing else was asked; None if they may.
+        unturned: names of drives whose sides do not differ where the body turns.
     """
 
     sources: Sources
@@ -93,6 +97,7 @@ class Recording:
     alignment: Alignment | None = None
     is_still: bool = False
     refused: Finding | None = None
+    unturned: tuple[str, ...] = ()
 
     @property
     def is_followed(self) -> bool:
@@ -159,36 +164,74 @@ _READ_AS = (
 """Keys of run.toml that say how the numbers of a signal are read."""
 _ALIKE = 1.3
 """Ratio of a length or a scale to the one that is known, up to which they are alike."""
+_UNLIKE = 7.5
+"""Ratio of a yaw rate to the one that is stated from which on its unit is another: degrees and radians
+are 57 times apart."""
 
 
 def examine(given: Given) -> Recording:
     """Decide which reading of a log's signals makes its body move as it does.
 
     Where something contradicts the log as run.toml reads it, it is examined without each section's keys for
-    units, signs, scales and frames, too, and without all of them. Those without which nothing is contradicted
-    that was not before, but for what the log itself corrects in their stead, are wrong, and no radius, gain
-    or wiring is blamed for it.
+    units, signs, scales and frames, too, without all of them, and without the joints of the sides. Those
+    without which nothing is contradicted that was not before, but for what the log itself corrects in their
+    stead, are wrong, and no radius, gain or wiring is blamed for it.
 
     Returns:
         What is in the log; without a pose in it where nothing can stand in for one.
+
+    Raises:
+        ConfigurationError: ``joint_unknown``: run.toml names a joint that is not in the log.
     """
+    _require_joints(given)
     recording = _examine(given)
     doubts = _list_doubts(recording, given)
-    lines = _list_readings(given.configuration) if doubts else {}
+    lines = _list_readings(given.configuration) if doubts else []
     # Each section alone, and then all: who mistakes a unit does so in both.
-    several = [[*lines]] if len(lines) > 1 else []
-    tried = [_try_without(given, roles, lines) for roles in [*([role] for role in lines), *several]]
+    several = {role: keys for part in lines for role, keys in part.items() if not keys.keys() & {*SIDES}}
+    tried = [_try_without(given, part) for part in [*lines, *([several] if len(several) > 1 else [])]]
     agreeing = [one for one in tried if one.doubts < doubts]
     agreeing += [one for one in tried if one.doubts - one.corrected < doubts - one.corrected]
     if not agreeing:
         return recording
+    best = agreeing[0]
     return replace(
         recording,
         findings=tuple(
-            Finding("configured_wrongly", "error", role, {"given": lines[role], "instead": made})
-            for role, made in agreeing[0].corrections.items()
+            Finding("configured_wrongly", "error", role, {"given": best.without[role], "instead": made})
+            for role, made in best.corrections.items()
         ),
     )
+
+
+def _require_joints(given: Given) -> None:
+    """Refuse joints that no topic of the log has.
+
+    Raises:
+        ConfigurationError: ``joint_unknown``.
+    """
+    for role in ("command", "wheels"):
+        section = getattr(given.configuration, role)
+        lists = {"left": section.left, "right": section.right, "front": section.front}
+        lists |= {"steering_joint": [section.steering_joint] if section.steering_joint else None}
+        lists |= {"factors": [one for one in section.factors or () if one not in SIDES]}
+        topics = {
+            columns.topic: joints
+            for columns in given.log.data.topics
+            if any(columns.topic == one.signals[0].topic for one in given.sources.rank_drives(role))
+            and (joints := list_joints(columns))
+        }
+        known = sorted({joint for joints in topics.values() for joint in joints})
+        for key, joints in lists.items():
+            unknown = [joint for joint in joints or () if joint not in known]
+            if known and unknown:
+                raise ConfigurationError(
+                    "joint_unknown",
+                    f"{key} under [{role}] names {name_first(unknown)}, which {name_first([*topics])} does "
+                    "not have",
+                    where=given.where,
+                    hint=f"Name joints of it: {name_first(known)}.",
+                )
 
 
 @dataclass(frozen=True)
@@ -196,24 +239,27 @@ class _Trial:
     """A log that is examined without keys of run.toml for some sections.
 
     Attributes:
+        without: the keys, with their values, by section.
         doubts: what contradicts it.
         corrections: lines that correct it in place of these keys, by section.
         corrected: those of the doubts that these are.
     """
 
+    without: Mapping[str, Mapping[str, object]]
     doubts: set[tuple[str, str]]
     corrections: dict[str, list[str]]
     corrected: set[tuple[str, str]]
 
 
-def _try_without(given: Given, roles: Sequence[str], lines: Mapping[str, Mapping[str, object]]) -> _Trial:
-    """The log examined without the keys of some sections."""
+def _try_without(given: Given, lines: Mapping[str, Mapping[str, object]]) -> _Trial:
+    """The log examined without keys of some sections."""
     plain = {
-        role: msgspec.structs.replace(getattr(given.configuration, role), **dict.fromkeys(lines[role]))
-        for role in roles
+        role: msgspec.structs.replace(getattr(given.configuration, role), **dict.fromkeys(keys))
+        for role, keys in lines.items()
     }
-    made = _examine(replace(given, configuration=msgspec.structs.replace(given.configuration, **plain)))
-    corrections: dict[str, list[str]] = {role: [] for role in roles}
+    given = replace(given, configuration=msgspec.structs.replace(given.configuration, **plain))
+    made = _examine(given)
+    corrections: dict[str, list[str]] = {role: [] for role in lines}
     corrected = set[tuple[str, str]]()
     for one in made.findings:
         if one.values.get("kind") != "corrected" or one.where not in corrections:
@@ -223,17 +269,18 @@ def _try_without(given: Given, roles: Sequence[str], lines: Mapping[str, Mapping
         if overruled.isdisjoint(one.values["otherwise"]):
             corrections[one.where].append(one.values["line"])
             corrected.add((one.id, one.where))
-    return _Trial(_list_doubts(made, given), corrections, corrected)
+    return _Trial(lines, _list_doubts(made, given), corrections, corrected)
 
 
-def _list_readings(configuration: Configuration) -> dict[str, dict[str, object]]:
-    """Keys of run.toml that say how numbers are read, with their values, by section."""
-    lines = dict[str, dict[str, object]]()
-    for role in ("command", "wheels", "pose", "imu"):
-        section = getattr(configuration, role)
-        given = {key: value for key in _READ_AS if (value := getattr(section, key, None)) is not None}
-        if given:
-            lines[role] = given
+def _list_readings(configuration: Configuration) -> list[dict[str, dict[str, object]]]:
+    """Keys of run.toml that say how numbers are read, with their values: by section, then of sides."""
+    lines = list[dict[str, dict[str, object]]]()
+    for keys in (_READ_AS, SIDES):
+        for role in ("command", "wheels", "pose", "imu"):
+            section = getattr(configuration, role)
+            given = {key: value for key in keys if (value := getattr(section, key, None)) is not None}
+            if given:
+                lines.append({role: given})
     return lines
 
 
@@ -253,12 +300,27 @@ def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
     radius = given.vehicle.wheel_radius_m
     radii = (radius / _ALIKE, radius * _ALIKE) if given.is_known else RADII_M
     ranges = {"gyro": [(1.0 / _ALIKE, _ALIKE)]}
+    doubts |= {("sides", one) for one in recording.unturned}
     for one in recording.evidence:
-        scale = one.turned if one.role == "gyro" else one.ahead
+        # A gyro that is upside down is no matter of its unit.
+        scale = abs(one.turned) if one.role == "gyro" else one.ahead
         usual = ranges.get(one.role, [(1.0 / _ALIKE, _ALIKE), radii])
+        if not 1.0 / _UNLIKE < _compare_turning(one, recording, given) < _UNLIKE:
+            doubts.add(("yaw rate", one.name))
         if scale and not any(low <= scale <= high for low, high in usual):
             doubts.add(("scale", one.name))
     return doubts
+
+
+def _compare_turning(one: Evidence, recording: Recording, given: Given) -> float:
+    """Turning of the body over that which a body command states, in its unit as taken; one of any other."""
+    source = getattr(recording.sources, one.role, None)
+    if not one.turned or not isinstance(source, DriveSource) or source.form is not DriveForm.BODY:
+        return 1.0
+    taken, read = (
+        RATES[getattr(each.configuration, one.role).yaw_unit or "rad/s"] for each in (recording, given)
+    )
+    return abs(one.turned) * read / taken
 
 
 def _examine(given: Given) -> Recording:
@@ -305,6 +367,18 @@ def _conclude(case: Case) -> Recording:
         tuple(evidence),
         case.alignment,
         case.is_still,
+        unturned=_list_unturned(case),
+    )
+
+
+def _list_unturned(case: Case) -> tuple[str, ...]:
+    """Drives whose sides do not differ where the body turns as other signals say."""
+    readings = [case.command.reading, case.wheels.reading, case.gyro]
+    turns = [bool(one.explained.sign("turned")) for one in readings]
+    return tuple(
+        one.name
+        for one, is_turning in zip(readings, turns, strict=True)
+        if one.form == "sides" and one.explained.is_sure and not is_turning and any(turns)
     )
 
 

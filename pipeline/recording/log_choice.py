@@ -621,6 +621,10 @@ def _list_equals(ratings: Sequence[PoseRating]) -> list[PoseRating]:
     ]
 
 
+_ANOTHER_BASE = 2.0
+"""Ratio of the wheelbase by which a car turns to its own one beyond which it is no slip of its tyres."""
+
+
 def _fit_vehicle(
     chosen: Choice,
     configuration: Configuration,
@@ -655,13 +659,13 @@ def _fit_vehicle(
     fitted = {key: length.value for key, length in lengths.items()}
     errors = {key: float(length.error) for key, length in lengths.items() if key not in known}
     values = {key: value for key, value in {**fitted, **known}.items() if key in LENGTHS}
+    findings = [*chosen.findings, *_contradict_wheelbase(recording.geometry, kind, given)]
     contradiction = _contradict_radius(recording.geometry, known)
     if contradiction:
         values = {key: value for key, value in values.items() if key in known}
     standing_in = None if sources.pose is None else sources.pose.wheels
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
     is_body = all(drive.form is DriveForm.BODY for drive in drives)
-    findings = list(chosen.findings)
     needed = {"differential": ("wheel_radius_m",), "mecanum": LENGTHS}.get(kind, ())
     if not is_body and (kind == "omni" or any(key not in values for key in needed)):
         if standing_in is not None:
@@ -728,6 +732,18 @@ def _contradict_radius(seen: Geometry, known: Mapping[str, object]) -> dict[str,
         return {}
     sizes = {"commanded_m": one, "rolled_m": other}
     return {name: [length.value, *length.interval] for name, length in sizes.items()}
+
+
+def _contradict_wheelbase(seen: Geometry, kind: str, given: Mapping[str, object]) -> list[Finding]:
+    """That a car turns as one of another wheelbase than the user's; else nothing."""
+    base, length = given.get("wheelbase_m"), seen.wheelbase
+    if kind != "ackermann" or not isinstance(base, float) or length is None:
+        return []
+    if abs(math.log(length.value / base)) < math.log(_ANOTHER_BASE):
+        return []
+    low, high = length.interval
+    values = {"given": base, "value": length.value, "low": low, "high": high}
+    return [Finding("wheelbase_contradicted", "warning", "vehicle", values)]
 
 
 def _take_unit_wheels(

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 
 import msgspec
@@ -22,8 +22,10 @@ from pipeline.sources import (
     COMMANDED,
     MEASURED,
     Configuration,
+    ConfigurationError,
     DriveForm,
     MessageType,
+    Signal,
     Sources,
     Vehicle,
     find_pose_fields,
@@ -33,6 +35,8 @@ from pipeline.sources import (
 )
 
 UNKNOWN = "unknown"
+_OF_FIELDS = ("left_topic", "right_topic", "speed_topic", "yaw_rate_topic", "steering_topic")
+"""Keys of a drive that may name a field of a topic."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,7 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     )
     recorded = index.deployment
     require_messages(index)
+    _require_elements(index, configuration)
     try:
         chosen, configuration = _choose(index, configuration, options)
     except SlipError as error:
@@ -102,6 +107,30 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
     return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+
+
+def _require_elements(index: LogIndex, configuration: Configuration) -> None:
+    """Refuse a number of an array that no message has.
+
+    Raises:
+        ConfigurationError: ``element_not_found``.
+    """
+    for role, key in product(("command", "wheels"), _OF_FIELDS):
+        signal = Signal.parse(getattr(getattr(configuration, role), key) or "")
+        for path in signal.fields() if signal.topic in index.topics() else ():
+            name, _, number = path.removesuffix("]").partition("[")
+            count = _count_elements(index, signal.topic, name) if number.isdecimal() else 0
+            if 0 < count <= int(number or 0):
+                what = f"{key} = {signal} under [{role}], but {name} of {signal.topic} has {count} numbers"
+                hint = f"They are counted from 0: the last one is {name}[{count - 1}]."
+                raise ConfigurationError("element_not_found", what, where=str(index.path), hint=hint)
+
+
+def _count_elements(index: LogIndex, topic: str, field: str) -> int:
+    """Most elements that a message has in a field; zero of a field that is no array."""
+    read = read_topics(index, [Wanted(topic, (field,))], sha256="unused", skip_unfit=True).topics
+    columns = [column for one in read if isinstance(column := one.fields.get(field), Ragged)]
+    return max((int(np.diff(one.offsets).max(initial=0)) for one in columns), default=0)
 
 
 def _choose(

@@ -10,7 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import CONFIDENCE, NORMAL_95, Floats, Ints, fit_robustly, robust_spread, student_quantile
+from pipeline.core import (
+    CONFIDENCE,
+    NORMAL_95,
+    Floats,
+    Ints,
+    fit_robustly,
+    format_line,
+    robust_spread,
+    student_quantile,
+)
 from pipeline.recording.case import Case
 from pipeline.recording.findings import Finding
 from pipeline.recording.geometry import roll_wheels
@@ -397,6 +406,9 @@ is found from -.04 to .06 s, by values that are held and by a lag that stands fo
 _EARLIER_S = np.arange(-3.0, DELAYS_S[0], 0.05)
 """Delays [s] of commands that are stamped after nearly all that they do."""
 
+_AS_MUCH = 0.3
+"""Share by which a delay may differ from the one that is configured where it is its mirror image."""
+
 
 def ask_delay(case: Case) -> Case:
     """Correct the times of a command that acts before it is sent, and tell a dead time.
@@ -406,7 +418,13 @@ def ask_delay(case: Case) -> Case:
     are late themselves, the first one alone says something.
     """
     command, is_driven = case.command, case.driven.is_known
-    if not command.is_sure or case.configuration.command.late_s is not None:
+    given = case.configuration.command.late_s
+    if not command.is_sure or given is not None:
+        seen = command.reading.explained.delay
+        # Stamps that were not late are early by what is taken off them.
+        if command.is_sure and given and abs(given) > _ERROR_S and abs(seen / given - 1.0) < _AS_MUCH:
+            values = {"source": str(command.source), "value": seen, "given": format_line("late_s", given)}
+            case.findings.append(Finding("late_as_configured", "warning", "command", values))
         return case
     reading = command.reading
     if is_driven:

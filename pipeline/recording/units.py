@@ -38,7 +38,7 @@ def ask_gyro(case: Case) -> Case:
         return case
     gyro = case.read_gyro().fitted(case.motion)
     case, made = replace(case, gyro=gyro), gyro.explained
-    if not made.sign("turned") or case.configuration.imu.unit is not None:
+    if not made.sign("turned") or case.configuration.imu.unit not in {None, *USUAL}:
         return case
     if abs(np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])) > 4.0 * _NEAR:
         return case
@@ -213,7 +213,9 @@ def _report_units(
     for index, (key, what) in enumerate((("unit", "speed"), (turn_key, turn))):
         unit = units.likeliest[index]
         of: dict[str, object] = {"what": what, "source": str(drive.source), "unit": unit}
-        if getattr(section, key) is not None or not unit:
+        given = getattr(section, key)
+        # What the user says settles it; that a log is in another unit than the usual one is told.
+        if not unit or (given is not None and (given not in USUAL or unit in USUAL)):
             continue
         is_too_fast = key == "unit" and drive.reading.form == "body" and (gains[0] or 0.0) > _FASTEST
         if unit in USUAL and is_too_fast and not (case.is_known and case.driven.is_known):

@@ -654,10 +654,27 @@ def _command_not_scaled(of: Values) -> str:
 
 def _tape_contradicts(of: Values) -> str:
     radius = f" and a wheel radius of {of['radius_m']:.4g} m" if "radius_m" in of else ""
+    known = f"the {of['vehicle']}" if of["is_named"] else "the other signals"
     return (
-        f"the distance that was measured by hand contradicts the {of['vehicle']}: by {of['source']}"
-        f"{radius} it drove {of['value']:.3g} times as far in this log. No length is taken from it: "
-        "measure all that the log holds, or record the measured drive alone"
+        f"the distance that was measured by hand contradicts {known}: by {of['source']}{radius} it drove "
+        f"{of['value']:.3g} times as far in this log. No length is taken from it: measure all that the log "
+        "holds, or record the measured drive alone"
+    )
+
+
+def _taped_both_ways(of: Values) -> str:
+    return (
+        f"what was measured by hand shows no length: by {of['source']} the vehicle drove forward and back "
+        f"({format_share(of['share'])} of the way against the rest), and a tape measures from start to end: "
+        "record a drive in one direction"
+    )
+
+
+def _taped_no_vehicle(of: Values) -> str:
+    return (
+        f"by what was measured by hand and {of['source']}, {of['key']} is {of['value']:.3g}, which no "
+        f"vehicle has ({of['least']:g} to {of['most']:g} m): it is not taken. Measure all that the log "
+        "holds, and check the unit of the wheel speeds (unit under [wheels] in run.toml)"
     )
 
 
@@ -1213,8 +1230,20 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         "by {value:.3g} ahead and {turn:.3g} in turning, with which the body moves as far as they say; gains "
         "of the drive and the ground are not known from them",
     },
+    "wheelbase_contradicted": "[vehicle] in run.toml gives wheelbase_m = {given:g}, but by commands and "
+    "poses the vehicle turns as one with a wheelbase of {value:.3g} m ({low:.3g} to {high:.3g} m): check the "
+    "line, and the unit of the steering angle",
+    "late_as_configured": "the motion follows {source} {value:.2f} s after its stamps, and {given} under "
+    "[command] in run.toml moves them by as much: without that line there is hardly a delay. Take it out, "
+    "unless the stamps are known to be late",
     "lengths_by_tape": _by_tape,
     "tape_contradicts_vehicle": _tape_contradicts,
+    "no_length_by_tape": {
+        "both ways": _taped_both_ways,
+        "no vehicle": _taped_no_vehicle,
+        "no radius": "the counted turns show no track: the wheel radius is not known (--wheel-radius gives "
+        "it, or --drove with the distance of a straight drive in the same log)",
+    },
     "poses_left_out": "{all} topics or frames hold poses: the {compared} with most messages were compared",
     "vehicle_choice": {"description": _preset_differs, "parameters": _controller_differs},
     "no_command": "the log contains no commands: it is analyzed from wheel encoders",

@@ -15,6 +15,7 @@ from rewritten_logs import Change, Log, list_changes, read, write
 from simulated_platforms import simulate_platform
 
 from pipeline.analysis import Options
+from pipeline.core import SlipError
 from pipeline.recording.log_setup import set_up_log
 from pipeline.sources import load_configuration
 from pipeline.words import format_finding
@@ -240,10 +241,10 @@ def test_a_case_of_the_field_is_told(name: str, tmp_path: Path) -> None:
 def test_joints_that_are_not_there_are_the_reason(tmp_path: Path) -> None:
     (tmp_path / "joints.toml").write_text('[wheels]\nleft = ["no_such"]\nright = ["nor_this"]')
     options = Options(out=tmp_path, config=tmp_path / "joints.toml")
-    told = set_up_log(CASES / "logs" / "y_up.mcap", options).choice.findings
-    (text,) = [format_finding(one) for one in told if one.id == "wheels_left_out"]
-    assert "[wheels]" in text
-    assert "radius" not in text
+    with pytest.raises(SlipError) as refused:
+        set_up_log(CASES / "logs" / "y_up.mcap", options)
+    assert "left under [wheels] names no_such" in refused.value.what
+    assert "radius" not in str(refused.value)
 
 
 @pytest.mark.long

@@ -356,7 +356,7 @@ def test_a_tape_and_turns_tell_radius_and_track(
         assert value == pytest.approx(length, rel=0.01)
         assert low < length < high
         assert f"{name} = " in format_finding(found)
-    with pytest.raises(SlipError, match=r"by hand, \[vehicle\] wheel_radius_m = .*; track_width_m = "):
+    with pytest.raises(SlipError, match=r"by hand, vehicle = \{wheel_radius_m = .*, track_width_m = .*\} in"):
         set_up_log(log, Options(out=tmp_path))
 
 
@@ -397,6 +397,173 @@ def test_a_tape_that_contradicts_the_vehicle_offers_no_length(samples: Path, tmp
     assert "wheel_radius_m" not in found.values
     said = format_finding(found)
     assert re.search(r"contradicts the .*Husky.* times as far in this log\. No length is taken", said), said
+
+
+def test_a_tape_that_contradicts_the_poses_offers_no_length(tmp_path: Path) -> None:
+    options = Options(out=tmp_path, overrides={"truth": {"distance_m": 2.0}})
+    findings = set_up_log(write_log(tmp_path / "log.mcap", draw(51)), options).choice.findings
+    said = " ".join(format_finding(one) for one in findings)
+    assert re.search(r"contradicts the other signals: by .* times as far in this log\. No length", said), said
+    assert not any(one.id == "lengths_by_tape" for one in findings)
+
+
+@pytest.mark.parametrize(
+    ("back", "truth", "said", "hint"),
+    [
+        (2.0, {"distance_m": 2.0, "turns": 10.0}, "forward and back", "drove forward and back"),
+        (1.96, {"distance_m": 2.0}, "50 % of the way|49 % of the way", "measures one way"),
+        (0.0, {"distance_m": 100.0, "turns": 10.0}, "which no vehicle has", "that no vehicle has"),
+        (0.0, {"turns": 10.0}, "wheel radius is not known", "give --wheel-radius, or --drove"),
+    ],
+)
+def test_what_is_measured_by_hand_is_refused_where_it_shows_no_length(
+    back: float, truth: dict[str, float], said: str, hint: str, tmp_path: Path
+) -> None:
+    radius, track = 0.0825, 0.45
+    still, second = np.zeros(round(2.0 / STEP)), round(1.0 / STEP)
+    ways = [np.full(8 * second, 2.0 / radius / 8.0), np.full(8 * second, -back / radius / 8.0)]
+    spin = np.full(40 * second, 10.0 * np.pi * track / radius / 40.0)
+    left, right = (
+        np.concatenate([still, ways[0], still, ways[1], still, side * spin, still]) for side in (-1.0, 1.0)
+    )
+    log = drive_by_hand(tmp_path / "log.mcap", left, right, None)
+    options = Options(out=tmp_path, overrides={"truth": truth})
+    (found,) = [one for one in inspect_log(log, options).notes if one.id == "no_length_by_tape"]
+    assert re.search(said, format_finding(found)), format_finding(found)
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, options)
+    assert hint in refused.value.hint
+    assert "wheel_radius_m =" not in refused.value.hint
+
+
+def numbered(path: Path, drive: Drive) -> Path:
+    """Four wheels whose names do not say their side: 1 and 4 are left."""
+    pair = sides(drive).inputs
+    joints = {f"wheel_{number}": pair[side] for number, side in zip(range(1, 5), (0, 1, 1, 0), strict=True)}
+    return write_log(path, drive, joints=joints)
+
+
+def upside_down(path: Path, drive: Drive) -> Path:
+    return write_log(path, drive, gyro=-drive.rate)
+
+
+CONFIGURED = [
+    (write_log, {"command": {"yaw_unit": "deg/s"}}, 'yaw_unit = "deg/s"', ""),
+    (upside_down, {"imu": {"unit": "deg/s"}}, 'unit = "deg/s"', ""),
+    (write_log, {"wheels": {"factors": {"left": 0.5}}}, 'factors = {"left" = 0.5}', ""),
+    (
+        numbered,
+        {"wheels": {"left": ["wheel_1", "wheel_2"], "right": ["wheel_3", "wheel_4"]}},
+        'right = ["wheel_3", "wheel_4"]',
+        'left = ["wheel_1", "wheel_4"]',
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "given", "said", "instead"), CONFIGURED)
+def test_a_line_that_the_log_contradicts_is_named(
+    make: Callable[[Path, Drive], Path],
+    given: dict[str, object],
+    said: str,
+    instead: str,
+    tmp_path: Path,
+) -> None:
+    findings = set_up_log(
+        make(tmp_path / "log.mcap", draw(51)), Options(out=tmp_path, overrides=given)
+    ).choice.findings
+    (error,) = [format_finding(one) for one in findings if one.severity == "error"]
+    assert "contradicts the other signals" in error
+    assert said in error
+    assert instead in error
+
+
+@pytest.mark.parametrize(
+    ("make", "given"),
+    [
+        (write_log, {"command": {"yaw_unit": "rad/s"}}),
+        (upside_down, {"imu": {"unit": "rad/s"}}),
+        (numbered, {"wheels": {"left": ["wheel_1", "wheel_4"], "right": ["wheel_2", "wheel_3"]}}),
+    ],
+)
+def test_a_line_that_is_right_is_obeyed(
+    make: Callable[[Path, Drive], Path], given: dict[str, object], tmp_path: Path
+) -> None:
+    options = Options(out=tmp_path, overrides=given)
+    setup = set_up_log(make(tmp_path / "log.mcap", draw(51)), options)
+    assert not {one.id for one in setup.choice.findings} & {"configured_wrongly", "kept_as_recorded"}
+
+
+@pytest.mark.parametrize(
+    ("make", "given"),
+    [
+        (turned_and_in_degrees, {"command": {"yaw_unit": "rad/s"}}),
+        (with_a_gyro_in_degrees, {"imu": {"unit": "rad/s"}}),
+    ],
+)
+def test_a_unit_that_keeps_a_log_as_recorded_is_obeyed_and_told(
+    make: Callable[[Path, Drive], Path], given: dict[str, object], tmp_path: Path
+) -> None:
+    options = Options(out=tmp_path, overrides=given)
+    setup = set_up_log(make(tmp_path / "log.mcap", draw(51)), options)
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "kept_as_recorded"]
+    assert any('unit = "rad/s", and it is taken as it is recorded' in one for one in told)
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({"left": ["wheel_1", "wheel_5"], "right": ["wheel_2"]}, "left under [wheels] names wheel_5"),
+        ({"left": ["wheel1"], "right": ["wheel2"]}, "left under [wheels] names wheel1"),
+        ({"factors": {"wheel_9": 0.5}}, "factors under [wheels] names wheel_9"),
+    ],
+)
+def test_a_joint_that_is_not_there_is_refused_with_those_that_are(
+    given: dict[str, object], what: str, tmp_path: Path
+) -> None:
+    log = numbered(tmp_path / "log.mcap", draw(51))
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, Options(out=tmp_path, overrides={"wheels": given}))
+    assert refused.value.code == "joint_unknown"
+    assert what in refused.value.what
+    assert "wheel_1, wheel_2, wheel_3 and wheel_4" in refused.value.hint
+
+
+def test_a_number_that_an_array_does_not_have_is_refused(tmp_path: Path) -> None:
+    log = numbered(tmp_path / "log.mcap", draw(51))
+    sections = {side: f"/joint_states.velocity[{at}]" for side, at in (("left_topic", 0), ("right_topic", 4))}
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, Options(out=tmp_path, overrides={"wheels": sections}))
+    assert refused.value.code == "element_not_found"
+    assert "velocity of /joint_states has 4 numbers" in refused.value.what
+    assert "the last one is velocity[3]" in refused.value.hint
+
+
+@pytest.mark.parametrize(("late_s", "is_told"), [(0.5, True), (0.01, False), (-1.0, False)])
+def test_a_delay_that_a_configured_time_makes_is_told(
+    late_s: float,
+    is_told: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    options = Options(out=tmp_path, overrides={"command": {"late_s": late_s}})
+    found = set_up_log(write_log(tmp_path / "log.mcap", draw(51)), options).choice.findings
+    told = [format_finding(one) for one in found if one.id == "late_as_configured"]
+    assert len(told) == is_told
+    assert all("late_s = 0.5 under [command]" in one for one in told)
+
+
+@pytest.mark.parametrize(("wheelbase", "is_told"), [(13.0, True), (1.3, False)])
+def test_a_wheelbase_by_which_a_car_does_not_turn_is_told(
+    wheelbase: float,
+    is_told: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    drive = draw(51)
+    speed = np.maximum(drive.asked[:, 0], 0.2)
+    car = np.column_stack([speed, np.arctan(drive.asked[:, 1] / speed)])
+    options = Options(out=tmp_path, overrides={"vehicle": {"kind": "ackermann", "wheelbase_m": wheelbase}})
+    setup = set_up_log(write_log(tmp_path / "log.mcap", drive, car=car), options)
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "wheelbase_contradicted"]
+    assert len(told) == is_told, setup.choice.recording.geometry
 
 
 @pytest.mark.parametrize(("spoilt", "share"), [("command", 0.55), ("command", 0.4), ("wheels", 0.55)])
