@@ -1,6 +1,6 @@
 """Examination of a log: from the columns of its candidates to a `Recording`, by a list of questions."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -186,7 +186,9 @@ def examine(given: Given) -> Recording:
     _require_joints(given)
     recording = _examine(given)
     doubts = _list_doubts(recording, given)
-    lines = _list_readings(given.configuration) if doubts else []
+    lines = _list_readings(given.configuration, _READ_AS) if doubts else []
+    # Sides that are exchanged are corrected; of wheels that are mixed there is nothing to correct.
+    lines += _list_readings(given.configuration, SIDES) if recording.unturned else []
     # Each section alone, and then all: who mistakes a unit does so in both.
     several = {role: keys for part in lines for role, keys in part.items() if not keys.keys() & {*SIDES}}
     tried = [_try_without(given, part) for part in [*lines, *([several] if len(several) > 1 else [])]]
@@ -272,15 +274,14 @@ def _try_without(given: Given, lines: Mapping[str, Mapping[str, object]]) -> _Tr
     return _Trial(lines, _list_doubts(made, given), corrections, corrected)
 
 
-def _list_readings(configuration: Configuration) -> list[dict[str, dict[str, object]]]:
-    """Keys of run.toml that say how numbers are read, with their values: by section, then of sides."""
+def _list_readings(configuration: Configuration, keys: Sequence[str]) -> list[dict[str, dict[str, object]]]:
+    """Those of some keys of run.toml that are given, with their values, a section at a time."""
     lines = list[dict[str, dict[str, object]]]()
-    for keys in (_READ_AS, SIDES):
-        for role in ("command", "wheels", "pose", "imu"):
-            section = getattr(configuration, role)
-            given = {key: value for key in keys if (value := getattr(section, key, None)) is not None}
-            if given:
-                lines.append({role: given})
+    for role in ("command", "wheels", "pose", "imu"):
+        section = getattr(configuration, role)
+        given = {key: value for key in keys if (value := getattr(section, key, None)) is not None}
+        if given:
+            lines.append({role: given})
     return lines
 
 

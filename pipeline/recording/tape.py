@@ -22,7 +22,7 @@ _TAPE_M, _TAPE = 5e-3, 5e-3
 """Error of a distance by a tape: 5 mm, or half a percent of it if that is more."""
 _FAR = 2.0
 """Ratio to the vehicle's own length beyond which the tape measured something else: no wheel wears so far."""
-_ONE_WAY = 0.8
+_STRAIGHT = 0.8
 """Way from start to end over the way in all, below which more than a tenth of a drive is driven back."""
 _TURNS = 0.1
 """Error of counted turns: a tenth of one, as a mark on the ground shows."""
@@ -48,20 +48,20 @@ def measure_by_tape(
     if truth == TruthSection():
         return []
     reading, gyro, is_rim = _read(index, configuration, choice)
-    (net, way), turning = _add_up(reading.first, reading.second, reading.form)
+    (net, path), turning = _add_up(reading.first, reading.second, reading.form)
     # Speeds of a body or of rims have a gain in place of a radius.
     is_gain = is_rim or reading.form == "body"
     known = 1.0 if is_gain else _find_radius(configuration, choice)
-    is_one_way = net > _ONE_WAY * way
-    moved = net if is_one_way else way
+    is_straight = net > _STRAIGHT * path
+    moved = net if is_straight else path
     taped = truth.distance_m / moved if truth.distance_m and moved > 0.0 else None
     source = reading.name
     # Of a drive that turns back a tape may have measured half.
-    contradiction = _contradict(source, taped, known, choice, most=_FAR if is_one_way else 2.0 * _FAR)
+    contradiction = _contradict(source, taped, known, choice, most=_FAR if is_straight else 2.0 * _FAR)
     if contradiction:
         return contradiction
-    if taped and not is_one_way:
-        turned_back = {"kind": "both ways", "source": source, "share": 0.5 * (1.0 - net / way)}
+    if taped and not is_straight:
+        turned_back = {"kind": "both ways", "source": source, "share": 0.5 * (1.0 - net / path)}
         return [Finding("no_length_by_tape", "warning", "vehicle", turned_back)]
     share = _share(truth.distance_m) if truth.distance_m and taped else 0.0
     values = {"ahead" if is_gain else "wheel_radius_m": _bound(taped, share)} if taped else {}
@@ -84,7 +84,7 @@ def _count_turns(truth: TruthSection, gyro: Held) -> tuple[float, float]:
     if truth.turns is not None:
         return truth.turns, _TURNS / truth.turns
     # A gyro counts turns as well as the eye.
-    return (_count_both_ways(_accumulate(gyro)[1]) / (2.0 * np.pi), 0.01) if gyro.moves else (0.0, 0.0)
+    return (_add_legs(_accumulate(gyro)[1]) / (2.0 * np.pi), 0.01) if gyro.moves else (0.0, 0.0)
 
 
 def _find_radius(configuration: Configuration, choice: Choice | None) -> float | None:
@@ -190,7 +190,7 @@ def _add_up(left: Held, right: Held, form: str) -> tuple[tuple[float, float], fl
     if form == "sides":
         other = np.interp(times, later, other) if later.size else np.zeros_like(one)
         one, other = 0.5 * (one + other), other - one
-    return (abs(float(one[-1])) if one.size else 0.0, _count_both_ways(one)), _count_both_ways(other)
+    return (abs(float(one[-1])) if one.size else 0.0, _add_legs(one)), _add_legs(other)
 
 
 def _accumulate(signal: Held) -> tuple[Floats, Floats]:
@@ -200,13 +200,13 @@ def _accumulate(signal: Held) -> tuple[Floats, Floats]:
     return times, arrays.integrate_rate(times, signal.values[known])
 
 
-def _count_both_ways(way: Floats) -> float:
+def _add_legs(signal: Floats) -> float:
     """Sum of the ways between the turning points of a heading or a distance: legs to either side add up."""
-    if not way.size:
+    if not signal.size:
         return 0.0
-    least, total = _LEAST_SWING * float(np.ptp(way)), 0.0
-    begin = far = float(way[0])
-    for value in way.tolist():
+    least, total = _LEAST_SWING * float(np.ptp(signal)), 0.0
+    begin = far = float(signal[0])
+    for value in signal.tolist():
         sense = 1.0 if far >= begin else -1.0
         if sense * (value - far) > 0.0:
             far = value
