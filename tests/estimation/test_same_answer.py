@@ -15,7 +15,7 @@ LOG = ROOT / ".." / "shared" / "strangers" / "logs" / "odometry_tf_and_commands.
 @pytest.mark.long
 @pytest.mark.skipif(not LOG.exists(), reason="../shared/strangers is not here")
 def test_the_order_of_names_in_memory_changes_no_answer(tmp_path: Path) -> None:
-    """Of this log two sets of effects cost about the same."""
+    """A search of this log can end at two sets of effects."""
     told = []
     for seed in ("0", "1", "2"):
         made = subprocess.run(
