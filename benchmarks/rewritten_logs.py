@@ -659,7 +659,7 @@ def _scale_command(log: Log, roles: Roles, ahead: float, turn: float) -> Log | N
         if one.topic != topics[0]:
             return one
         content = _copy(one.content)
-        twist = content.get("twist", content)
+        twist = _find_twist(content)
         twist["linear"]["x"] *= ahead
         twist["angular"]["z"] *= turn
         return replace(one, content=content)

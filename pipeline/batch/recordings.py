@@ -100,8 +100,10 @@ class Looker:
 
     def is_recording(self, path: Path) -> bool:
         """Whether a file is to be read, by its name, or by its content where something follows the suffix."""
-        if path.name.endswith(SUFFIXES) or not _LIKE_SUFFIX.search(path.name):
-            return path.name.endswith(SUFFIXES)
+        if path.name.endswith(SUFFIXES):
+            return True
+        if not _LIKE_SUFFIX.search(path.name):
+            return False
         content = self.ask(path, lambda: judge_content(path))
         if content is not None and content.packed is not None:
             self.leave(path, *content.packed)
@@ -373,16 +375,15 @@ def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
 
 
 def _list_recordings(folder: Folder, looker: Looker) -> Iterator[Path]:
-    logs = [name for name in folder.files if name.endswith(SUFFIXES)]
     is_listed = LISTING in folder.files
-    parts = set(list_parts(folder.path, logs, is_listed=is_listed))
+    parts = set(list_parts(folder.path, folder.files, is_listed=is_listed))
     if len(parts) > 1 and not is_listed:
         files = sorted((folder.files[name] for name in parts), key=split_number)
         parts = set() if looker.ask(folder.path, partial(are_separate, files)) else parts
     if parts:
         yield folder.path
     for name, file in folder.files.items():
-        if name not in parts and (name in logs or looker.is_recording(file)):
+        if name not in parts and looker.is_recording(file):
             yield file
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import suffix_unit
 from pipeline.models import OVERSHOOT, Conditions, Effect, Parameter, find_effect
 from pipeline.recording import Finding
 from pipeline.results import Moves, Named
@@ -162,8 +163,7 @@ def _refuse_value(parameter: Parameter, value: float, why: str) -> str:
 
 
 def _format_value(value: float, parameter: Parameter, digits: int = 3) -> str:
-    text = f"{value:.{digits}g}"
-    return text if parameter.unit == "1" else f"{text} {parameter.unit}"
+    return f"{value:.{digits}g}{suffix_unit(parameter.unit)}"
 
 
 def measure_moves(fitted: Fitted, effect: Effect) -> Moves | None:

@@ -180,10 +180,12 @@ def _compare_rates(
     asked, got = (_read(table, vehicle) for table in (commands, wheels))
     motion = roll_wheels(got)
     nothing: Floats = np.zeros(0)
-    there = [one.is_there(motion.steps) for one in asked.inputs] if motion.is_known else []
-    if not (there and np.logical_and.reduce(there).any()):
+    there: Flags = np.zeros(0, dtype=bool)
+    if motion.is_known and asked.inputs:
+        there = np.logical_and.reduce([one.is_there(motion.steps) for one in asked.inputs])
+    if not there.any():
         return _Rates((nothing, nothing), (nothing, nothing), np.zeros(0, dtype=np.int64))
-    motion = motion.take(np.logical_and.reduce(there))
+    motion = motion.take(there)
     elapsed = motion.steps.end - motion.steps.start
     ahead, turned = asked.columns(motion.steps, *late, crossed=False)
     rates = motion.body.real / elapsed, motion.yaw / elapsed

@@ -217,11 +217,13 @@ def _require_joints(given: Given) -> None:
         lists = {"left": section.left, "right": section.right, "front": section.front}
         lists |= {"steering_joint": [section.steering_joint] if section.steering_joint else None}
         lists |= {"factors": [one for one in section.factors or () if one not in SIDES]}
+        if not any(lists.values()):
+            continue
+        drives = {one.signals[0].topic for one in given.sources.rank_drives(role)}
         topics = {
             columns.topic: joints
             for columns in given.log.data.topics
-            if any(columns.topic == one.signals[0].topic for one in given.sources.rank_drives(role))
-            and (joints := list_joints(columns))
+            if columns.topic in drives and (joints := list_joints(columns))
         }
         known = sorted({joint for joints in topics.values() for joint in joints})
         for key, joints in lists.items():

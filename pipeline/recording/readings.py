@@ -41,13 +41,13 @@ SIDES = ("left", "right")
 DELAYS_S = np.arange(-0.3, 0.81, 0.05)
 _LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
 _MOST_ROWS = 2000
+"""Number of steps on which delays are compared first."""
 _PARTS = 10
 """Parts of a drive, of equal path, among which a gain is looked for that changes during it."""
 _FEWEST_PARTS = 3
 """Least number of them on either side of a change: one may be that in which it lies."""
 _VARIES = 0.5 * math.log(2.0)
 """Logarithm up to which gains of one side differ; those of both sides are apart by a factor of two."""
-"""Number of steps on which delays are compared first."""
 
 
 class Held:

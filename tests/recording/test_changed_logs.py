@@ -58,6 +58,13 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Log,
     return made
 
 
+def write_changed(path: Path, log: Log, change: str, folder: Path) -> Path:
+    """A log with a change that it allows."""
+    made = CHANGES[change].make(log, find_roles(path))
+    assert made is not None
+    return write(made, folder / path.name)
+
+
 def check(logs: dict[str, tuple[Path, Log, Answer]], name: str, change: Change, folder: Path) -> None:
     path, log, before = logs[name]
     made = change.make(log, find_roles(path))
@@ -92,9 +99,7 @@ def test_the_line_that_is_offered_settles_it(
     logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, line: str, tmp_path: Path
 ) -> None:
     path, log, _ = logs[name]
-    made = CHANGES[change].make(log, find_roles(path))
-    assert made is not None
-    changed = write(made, tmp_path / path.name)
+    changed = write_changed(path, log, change, tmp_path)
     (tmp_path / "line.toml").write_text(line)
     found, settled = (
         set_up_log(changed, Options(out=tmp_path, config=config)).choice
@@ -128,9 +133,7 @@ def test_the_line_that_takes_them_as_recorded_is_obeyed(
     logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, tmp_path: Path
 ) -> None:
     path, log, _ = logs[name]
-    made = CHANGES[change].make(log, find_roles(path))
-    assert made is not None
-    changed = write(made, tmp_path / path.name)
+    changed = write_changed(path, log, change, tmp_path)
     first = set_up_log(changed, Options(out=tmp_path)).choice.findings
     (told,) = [one for one in first if one.values.get("kind") == "corrected"]
     (line,) = told.values["otherwise"]
@@ -159,10 +162,8 @@ def test_a_tape_is_compared_with_what_is_corrected(
     logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
 ) -> None:
     path, log, _ = logs["husky_tile"]
-    made = CHANGES["wheels in rpm"].make(log, find_roles(path))
-    assert made is not None
     told = []
-    for one in (path, write(made, tmp_path / path.name)):
+    for one in (path, write_changed(path, log, "wheels in rpm", tmp_path)):
         options = Options(out=tmp_path, overrides={"truth": {"distance_m": 5.0}})
         told += [
             [each.values["value"], each.values["radius_m"]]
@@ -177,11 +178,10 @@ def test_a_unit_that_the_user_gives_is_not_decided_otherwise(
     logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
 ) -> None:
     path, log, _ = logs["turtlebot4"]
-    made = CHANGES["yaw rate in degrees"].make(log, find_roles(path))
-    assert made is not None
+    changed = write_changed(path, log, "yaw rate in degrees", tmp_path)
     (tmp_path / "line.toml").write_text('[command]\nyaw_unit = "rad/s"')
     options = Options(out=tmp_path, config=tmp_path / "line.toml")
-    choice = set_up_log(write(made, tmp_path / path.name), options).choice
+    choice = set_up_log(changed, options).choice
     assert choice.recording.configuration.command.yaw_unit == "rad/s"
     assert not [one for one in choice.findings if one.severity == "error"]
 
@@ -270,8 +270,6 @@ def test_cases_of_the_field_say_what_they_must(tmp_path: Path) -> None:
 @pytest.mark.parametrize("change", ["pivots about the left wheels", "nothing but such pivots"])
 def test_a_recording_of_pivots_has_no_dead_encoder(change: str, tmp_path: Path) -> None:
     """Between long rests, on ground where wheels slip aside."""
-    made = CHANGES[change].make(read(RECORDED), find_roles(RECORDED))
-    assert made is not None
-    after = ask(write(made, tmp_path / RECORDED.name))
+    after = ask(write_changed(RECORDED, read(RECORDED), change, tmp_path))
     assert after.medians
     assert judge(CHANGES[change], ask(RECORDED), after) == "same"
