@@ -673,7 +673,7 @@ def judge(
         refusal = "the error on data that it was not fitted to does not fall"
     else:
         is_proven = True
-        if felt < SHOWN:
+        if felt < SHOWN and not _outdoes_another(fit, effect, matrix):
             refusal = (
                 f"no error against {path.target} falls by more than {format_share(felt)}, "
                 f"required {format_share(SHOWN)}"
@@ -681,6 +681,24 @@ def judge(
         elif not _is_material(path, change):
             refusal = "what it moves is less than a map resolves"
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
+
+
+def _outdoes_another(fit: PathFit, effect: Effect, matrix: Matrix) -> bool:
+    """Whether a model of as many effects would be better with an effect, felt there, in the place of another.
+
+    What two effects do alike, each does little of beside the other: the better one would go without a name.
+    """
+    own, path = matrix.expect_change(Move().drop(effect.id)), fit.path
+    for other in fit.ids:
+        if other == effect.id or not matrix.expect_change(Move().drop(other)) < own - EQUAL:
+            continue
+        (there,), (neither,) = (
+            matrix.list_states(Move().drop(*gone)) for gone in ((other,), (other, effect.id))
+        )
+        alone = replace(fit, state=there, residual=path.find_residuals(there))
+        if find_expected_fall(alone, path.find_residuals(neither) - alone.residual) >= SHOWN:
+            return True
+    return False
 
 
 def _find_frequency(matrix: Matrix, change: Move, without: Move) -> float:
