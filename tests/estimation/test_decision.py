@@ -186,6 +186,21 @@ def test_a_lag_gives_way_to_one_of_which_it_is_a_special_case() -> None:
     assert estimate_path(found.final).find("brake_lag.tau_brake").value == pytest.approx(1.5, abs=0.1)
 
 
+@pytest.mark.parametrize(("limit", "seed"), [(1.5, 2), (2.5, 1)])
+def test_of_two_that_do_much_alike_the_better_has_a_name(limit: float, seed: int) -> None:
+    """Each did too little beside the other to be felt, and neither had one."""
+    hidden = {"drive_lag": 0.12, "body_acceleration_limit": limit}
+    run = drive(
+        hidden, seed=seed, duration_s=120.0, program=Program("drive_steps"),
+        disturbance=Disturbance(0.2, 0.2), encoders=None, imu=None,
+    )  # fmt: skip
+    data = prepare_data([run], HUSKY, Input.COMMAND)
+    both = [one for one in data.list_candidates(Input.COMMAND) if one.id in hidden]
+    found = Search(data.paths[-1], tuple(both), data.conditions).run(data.start_state())
+    assert {*found.judged} == {*hidden}
+    assert "body_acceleration_limit" in found.new
+
+
 def test_the_matrix_knows_what_a_set_costs_before_it_is_fitted() -> None:
     """Of numbers that act linearly it is what a fit under the same noise finds."""
     made, found, _ = search(drive({"effective_track": 1.3, "lateral_skid": 0.3}))
