@@ -78,7 +78,7 @@ def test_what_the_screens_of_a_sample_advise_can_be_typed(place: Path) -> None:
         assert done.returncode == 0, done.stderr
         screens.append(done.stdout)
     found = [line for screen in screens for line in PRINTED.findall(screen)]
-    assert len(found) >= 6
+    assert len(found) >= len(screens)
     for line in found:
         require_command(line)
     page = Codes()
