@@ -162,7 +162,7 @@ def estimate_path(fit: PathFit) -> Estimates:
     observable = information > _SMALLEST**2 * float(information.max(initial=0.0))
     known = _bound_information(fit)
     plain, carried = join_covariance(fit, known), carry_clocks(fit, known)
-    variance = np.diag(plain) + carried + carry_lengths(fit, known)
+    variance = np.diag(plain) + carried + carry_given(fit, known)
     errors = np.where(observable, np.sqrt(variance), math.nan)
     for index, number in enumerate(fit.free):
         if not number.is_smooth:
@@ -194,7 +194,7 @@ def _bound_information(fit: PathFit) -> Floats:
 def find_covariance(fit: PathFit) -> Floats:
     """Covariance of the numbers of a fit with the errors of clocks and lengths, shape (p, p)."""
     known = _bound_information(fit)
-    return join_covariance(fit, known) + np.diag(carry_clocks(fit, known) + carry_lengths(fit, known))
+    return join_covariance(fit, known) + np.diag(carry_clocks(fit, known) + carry_given(fit, known))
 
 
 def _find_width(fit: PathFit, number: Free) -> float:
@@ -226,9 +226,9 @@ def carry_clocks(fit: PathFit, information: Floats) -> Floats:
     return carried
 
 
-def carry_lengths(fit: PathFit, information: Floats) -> Floats:
-    """Variance of each number by dimensions of the vehicle that were estimated from the log, shape (p,)."""
-    shifts = fit.path.list_length_shifts(fit.state)
+def carry_given(fit: PathFit, information: Floats) -> Floats:
+    """Variance of each number by estimated dimensions of the vehicle, and by sensors of its drive, shape (p,)."""
+    shifts = fit.path.list_shifts(fit.state)
     return np.asarray(
         sum((_carry(fit, information, shift[:, :, None]) for shift in shifts), np.zeros(len(fit.free)))
     )

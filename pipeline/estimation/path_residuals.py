@@ -24,7 +24,7 @@ from pipeline.estimation.model_state import (
 from pipeline.estimation.noise import Steps, learn_noise
 from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import average_windows, locate_windows, number_stretches
-from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_late, find_late_effect
+from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_effect, find_late, find_late_effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -177,7 +177,7 @@ class PathResiduals(ABC):
             The increments, and the sign with which they stand in the residuals; zero if dimensions cancel.
         """
 
-    def list_length_shifts(self, state: ModelState) -> list[Floats]:
+    def list_shifts(self, state: ModelState) -> list[Floats]:
         """Changes of the residuals by one standard error of each estimated dimension, shape (n, 3) each.
 
         Speeds of wheels times a radius, over a track or a wheelbase, are the body's motion.
@@ -414,10 +414,12 @@ class WheelResiduals(PathResiduals):
         """
         return self._compare(state, run)
 
-    def _compare(self, state: ModelState, run: int, late_s: float = 0.0) -> Floats:
-        """Velocities with the encoders later by ``late_s`` [s]."""
+    def _compare(
+        self, state: ModelState, run: int, late_s: float = 0.0, beside: tuple[Effect, ...] = ()
+    ) -> Floats:
+        """Velocities with the encoders later by ``late_s`` [s], and with effects beside those of the state."""
         run_residuals = self.residuals_by_run[run]
-        drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
+        drive = (*(effect for effect in state.effects_of(run) if self.owns(effect)), *beside)
         timing = state.timing[run]
         # By how much readings are late the ground tells; a dead time beyond it is that of the commands.
         late_s += timing.wheel_delay_s if _has_dead_time(state) else timing.encoder_delay_s
@@ -435,6 +437,22 @@ class WheelResiduals(PathResiduals):
     def shift_clock(self, state: ModelState, run: int, late_s: float) -> Floats:
         """See `PathResiduals`: the encoders are later by ``late_s`` than assumed."""
         return self._multiply(self._compare(state, run, late_s), run)
+
+    def list_shifts(self, state: ModelState) -> list[Floats]:
+        """See `PathResiduals`; and by the time within a period at which steering was read.
+
+        Steering has a sensor of its own: the delay that the speeds tell is not that of the angle.
+        """
+        shifts = super().list_shifts(state)
+        if not self.residuals_by_run[0].context.vehicle.kinematics.has_inputs("steering"):
+            return shifts
+        for run, one in enumerate(self.residuals_by_run):
+            late = find_effect("steering_lag")(tau=one.run.wheel_period_s / _UNIFORM)
+            change, mine = np.zeros((self.run.size, 3)), self.run == run
+            moved = self._multiply(self._compare(state, run, beside=(late,)), run)
+            change[mine] = moved - self._multiply(self._compare(state, run), run)
+            shifts.append(change)
+        return shifts
 
     def list_rolled(self, state: ModelState) -> tuple[Floats, float]:  # noqa: ARG002 - wheels are as they are
         """See `PathResiduals`: the measured wheels, which body commands are compared with."""

@@ -17,7 +17,7 @@ from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.fit import invert
 from pipeline.models import Model, find_effect
 from pipeline.results.reading import DETECTED_SHARE
-from pipeline.simulate import Disturbance, Program
+from pipeline.simulate import VEHICLES, Disturbance, Program
 
 if TYPE_CHECKING:
     from pipeline.estimation.path_residuals import PathResiduals
@@ -73,6 +73,19 @@ def test_errors_of_a_track_that_was_estimated_are_carried() -> None:
     assert carried.value == exact.value
     expected = math.hypot(exact.standard_error, 0.01 * exact.value)
     assert carried.standard_error == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("truth", [{"steering_lag": 0.4356}, {"steering_rate_limit": 0.4}])
+def test_when_a_steering_sensor_was_read_is_not_known(truth: dict[str, float], seed: int) -> None:
+    """Speeds that jump between two readings tell a delay of 20 ms, which was taken for that of the angle."""
+    car, ((name, value),) = vehicle_of("ackermann_car"), truth.items()
+    run = simulate(truth, seed=seed, vehicle=VEHICLES["car"], program=Program("drive_steps"))
+    data = EstimationData([run], car, Input.COMMAND)
+    fitted = fit_model(data, Model(car, (find_effect(name)(),)), exact=True)
+    (number,) = (one for one in estimate_intervals(fitted).items if one.free.effect == name)
+    assert number.low < value < number.high
+    assert number.half < 0.1 * value
 
 
 def _change_track(state: State) -> tuple[float, float, float]:
