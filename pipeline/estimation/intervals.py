@@ -227,7 +227,7 @@ def carry_clocks(fit: PathFit, information: Floats) -> Floats:
 
 
 def carry_given(fit: PathFit, information: Floats) -> Floats:
-    """Variance of each number by estimated dimensions of the vehicle, and by sensors of its drive, shape (p,)."""
+    """Variance of each number by estimated dimensions of the vehicle and sensors of its drive, shape (p,)."""
     shifts = fit.path.list_shifts(fit.state)
     return np.asarray(
         sum((_carry(fit, information, shift[:, :, None]) for shift in shifts), np.zeros(len(fit.free)))

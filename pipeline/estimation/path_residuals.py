@@ -417,7 +417,7 @@ class WheelResiduals(PathResiduals):
     def _compare(
         self, state: ModelState, run: int, late_s: float = 0.0, beside: tuple[Effect, ...] = ()
     ) -> Floats:
-        """Velocities with the encoders later by ``late_s`` [s], and with effects beside those of the state."""
+        """Velocities with the encoders later by ``late_s`` [s], and effects beside those of the state."""
         run_residuals = self.residuals_by_run[run]
         drive = (*(effect for effect in state.effects_of(run) if self.owns(effect)), *beside)
         timing = state.timing[run]
