@@ -24,13 +24,14 @@ from pipeline.estimation.model_state import (
 from pipeline.estimation.noise import Steps, learn_noise
 from pipeline.estimation.run_residuals import Input, RunResiduals
 from pipeline.estimation.window_residuals import average_windows, locate_windows, number_stretches
-from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_effect, find_late, find_late_effect
+from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_late, find_late_effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.core import Complex, Flags, Floats, Ints
     from pipeline.estimation.noise import Noise
+    from pipeline.estimation.window_residuals import WindowSpans
     from pipeline.run import Velocity
 
 BLOCK_S = 20.0
@@ -46,6 +47,8 @@ _MOST_PERIODS = 2.0
 _MOST_LEFT = 0.5
 """Share of the mean square motion of wheels that a model of the drivetrain may leave: in drawn logs, drives
 that follow leave less than a hundredth, those that do not more than six tenths."""
+_CREEPING = 0.01
+"""Speed below which a path has no curvature [m/s]."""
 _NO_DELAY = Timing()
 _UNIFORM = 12.0**0.5
 """Ratio of width and standard deviation of a uniform distribution."""
@@ -414,19 +417,25 @@ class WheelResiduals(PathResiduals):
         """
         return self._compare(state, run)
 
-    def _compare(
-        self, state: ModelState, run: int, late_s: float = 0.0, beside: tuple[Effect, ...] = ()
-    ) -> Floats:
-        """Velocities with the encoders later by ``late_s`` [s], and effects beside those of the state."""
-        run_residuals = self.residuals_by_run[run]
-        drive = (*(effect for effect in state.effects_of(run) if self.owns(effect)), *beside)
+    def _compare(self, state: ModelState, run: int, late_s: float = 0.0) -> Floats:
+        """Velocities with the encoders later by ``late_s`` [s]."""
+        driven = average_windows(
+            self.residuals_by_run[run], self._drive(state, run), self._locate(state, run, late_s)
+        )
+        apart: Floats = self._seen[run] - driven
+        return apart
+
+    def _drive(self, state: ModelState, run: int) -> Velocity:
+        """Ideal velocity of the wheels of a model on the cells."""
+        drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
+        return self.residuals_by_run[run].predict_wheels(drive, _NO_DELAY)
+
+    def _locate(self, state: ModelState, run: int, late_s: float = 0.0) -> WindowSpans:
+        """Windows of the model that readings are of, with the encoders later by ``late_s`` [s]."""
         timing = state.timing[run]
         # By how much readings are late the ground tells; a dead time beyond it is that of the commands.
         late_s += timing.wheel_delay_s if _has_dead_time(state) else timing.encoder_delay_s
-        spans = self._spans[run] if late_s == 0.0 else locate_windows(run_residuals, late_s)
-        driven = average_windows(run_residuals, run_residuals.predict_wheels(drive, _NO_DELAY), spans)
-        apart: Floats = self._seen[run] - driven
-        return apart
+        return self._spans[run] if late_s == 0.0 else locate_windows(self.residuals_by_run[run], late_s)
 
     def list_clock_errors(self, state: ModelState) -> Floats:
         """See `PathResiduals`: when within a cell, or a period, an encoder was read is not known."""
@@ -447,10 +456,15 @@ class WheelResiduals(PathResiduals):
         if not self.residuals_by_run[0].context.vehicle.kinematics.has_inputs("steering"):
             return shifts
         for run, one in enumerate(self.residuals_by_run):
-            late = find_effect("steering_lag")(tau=one.run.wheel_period_s / _UNIFORM)
+            velocity, late_s = self._drive(state, run), one.run.wheel_period_s / _UNIFORM
+            curvature = np.divide(
+                velocity.w, velocity.x, out=np.zeros_like(velocity.w), where=np.abs(velocity.x) > _CREEPING
+            )
+            times = one.grid.times
+            apart = velocity.w - velocity.x * np.interp(times - late_s, times, curvature)
             change, mine = np.zeros((self.run.size, 3)), self.run == run
-            moved = self._multiply(self._compare(state, run, beside=(late,)), run)
-            change[mine] = moved - self._multiply(self._compare(state, run), run)
+            turned = replace(velocity, x=np.zeros_like(apart), y=np.zeros_like(apart), w=apart)
+            change[mine] = self._multiply(average_windows(one, turned, self._locate(state, run)), run)
             shifts.append(change)
         return shifts
 
