@@ -158,6 +158,17 @@ def test_a_delay_too_small_for_a_name_keeps_none_from_what_comes_with_it() -> No
     assert not found.rivals
 
 
+def test_the_ground_changes_beside_the_track_that_both_grounds_share() -> None:
+    """A track was taken for a special case of a change, and the ground was said to wear out over the run."""
+    hidden = {"effective_track": 1.6, "terrain_change": {"k_v": 0.83, "k_w": 0.79, "at_s": 120.0}}
+    _, found, _ = search(drive(hidden, duration_s=240.0))
+    assert set(found.new) == {"effective_track", "terrain_change"}
+    change = estimate_path(found.final)
+    for label, value in (("k_v", 0.83), ("k_w", 0.79)):
+        number = change.find(f"terrain_change.{label}")
+        assert number.low < value < number.high
+
+
 def test_of_two_effects_that_do_the_same_both_are_reported() -> None:
     """Where nothing but turning on the spot was driven, radius and track are one number."""
     made, found, _ = search(drive({"effective_track": 1.3}, program=Program("spins")))
