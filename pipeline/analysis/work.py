@@ -14,7 +14,7 @@ from pipeline.analysis import STAGES, Options
 from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory, round_numbers
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, Loss
-from pipeline.recording import POSE_FINDINGS, Finding, Given, extract_tables
+from pipeline.recording import MISREAD, POSE_FINDINGS, Finding, Given, extract_tables
 from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, MotionError, read_alignment, read_wheels
 from pipeline.sources import Vehicle, describe_types
@@ -283,7 +283,7 @@ class Work:
         self.write("events", made.events)
         checked: Sequence[Finding] = ()
         # Of signals that run.toml reads wrongly, nothing else is said.
-        if not any(one.id == "configured_wrongly" for one in setup.choice.findings):
+        if not any(one.id in MISREAD for one in setup.choice.findings):
             checked = checks.check_run(
                 velocities,
                 tables,
@@ -361,7 +361,7 @@ def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 24, "velocity": 7, "slip": 24, "aggregate": 4}
+VERSIONS: Mapping[str, int] = {"extract": 25, "velocity": 7, "slip": 24, "aggregate": 4}
 
 
 EXTRACTED = ("commands", "wheels", "poses", "imu")

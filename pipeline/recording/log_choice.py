@@ -14,7 +14,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -310,9 +309,11 @@ def _choose_readable(
     ]
     recorded = find_preset(index.deployment.get("vehicle") or "")
     witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
-    findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
+    contradiction = next(_list_contradictions(witnesses, vehicle, source), None)
+    findings += [contradiction[0]] if contradiction else []
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     chosen = _choose_pose(chosen, channels, index, configuration)
+    chosen = _settle_by_motion(chosen, *contradiction) if contradiction else chosen
     taken = chosen.sources
     if taken.command is None and taken.wheels is not None and taken.pose is not None:
         finding = Finding("no_command", "info", "command")
@@ -516,8 +517,8 @@ def _apply_controller(
 
 def _list_contradictions(
     witnesses: Sequence[Recognized], vehicle: Vehicle, source: VehicleSource
-) -> Iterator[Finding]:
-    """Findings on a chosen vehicle that what the log shows, or says of itself, contradicts."""
+) -> Iterator[tuple[Finding, Vehicle]]:
+    """Findings on a chosen vehicle that what the log shows or says contradicts, each with that vehicle."""
     for one in witnesses:
         differing = list_contradictions(one.vehicle, vehicle)
         is_given = source in {"flag", "configuration", "metadata"} and source != one.source
@@ -529,7 +530,34 @@ def _list_contradictions(
                 "vehicle": vehicle.name,
                 "is_flag": source == "flag",
             }
-            yield Finding("vehicle_contradiction", "warning", "vehicle", values)
+            yield Finding("vehicle_contradiction", "warning", "vehicle", values), one.vehicle
+
+
+_SAME_RADIUS = 1.3
+"""Ratio of the radius by the motion to that of a vehicle, up to which wheels may have it and slip."""
+
+
+def _settle_by_motion(chosen: Choice, contradiction: Finding, other: Vehicle) -> Choice:
+    """The choice, with a finding where wheels roll as those of the vehicle that the log indicates alone."""
+    recording, stated = chosen.recording, chosen.vehicle.wheel_radius_m
+    if recording is None:
+        return chosen
+    for one in recording.evidence:
+        drive = getattr(chosen.sources, one.role, None)
+        if not isinstance(drive, DriveSource) or drive.form not in {DriveForm.JOINTS, DriveForm.SIDES}:
+            continue
+        section = getattr(recording.configuration, one.role)
+        if not one.ahead or section.unit not in {None, "rad/s"} or section.scale is not None:
+            continue
+        fits = [
+            radius is not None and abs(math.log(abs(one.ahead) / radius)) < math.log(_SAME_RADIUS)
+            for radius in (stated, other.wheel_radius_m)
+        ]
+        if fits == [False, True]:
+            values = {**contradiction.values, "value": abs(one.ahead), "radius_m": stated}
+            finding = Finding("vehicle_by_motion", "error", "vehicle", values)
+            return replace(chosen, findings=(*chosen.findings, finding))
+    return chosen
 
 
 def _compare(chosen: Choice, given: Given) -> Choice:
