@@ -395,6 +395,9 @@ def key_stages(
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},
     }
+    # A file that is found beside the log later is told all the same.
+    if files := [one.values["why"] for one in setup.choice.findings if one.id == "file_not_read"]:
+        own["extract"]["files_not_read"] = files
     # A higher limit reads more of the log.
     unread = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
     if unread:

@@ -554,7 +554,14 @@ def _settle_by_motion(chosen: Choice, contradiction: Finding, other: Vehicle) ->
             for radius in (stated, other.wheel_radius_m)
         ]
         if fits == [False, True]:
-            values = {**contradiction.values, "value": abs(one.ahead), "radius_m": stated}
+            values = {
+                "source": contradiction.values["source"],
+                "indicated": other.name,
+                "vehicle": chosen.vehicle.name,
+                "is_flag": chosen.vehicle_source == "flag",
+                "value": abs(one.ahead),
+                "radius_m": stated,
+            }
             finding = Finding("vehicle_by_motion", "error", "vehicle", values)
             return replace(chosen, findings=(*chosen.findings, finding))
     return chosen

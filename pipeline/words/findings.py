@@ -1435,6 +1435,7 @@ _DIAGNOSIS: Mapping[str, Template | Mapping[str, Template]] = {
     "quarantine_{where}",
     "log_note": "{note}",
     "log_unchecked": "{why}",
+    "file_not_read": "{why}",
     "repeated_messages": {
         "removed": "{count} messages of {where} are byte-for-byte copies of others: duplicates were removed",
         "ignored": "{count} messages of {where} are byte-for-byte copies of others: duplicates are ignored",
