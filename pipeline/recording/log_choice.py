@@ -302,7 +302,7 @@ def _choose_readable(
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
         sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
-    findings += beside
+    findings += [*_list_silent(channels, configuration, vehicle, sources, where), *beside]
     findings += [
         Finding("vehicle_choice", "info", "vehicle", note)
         for note in (recognized.notes if recognized else ())
@@ -365,8 +365,39 @@ def _lacks_pose(
     """
     if sources.command is None or sources.wheels is None:
         return False
-    announced = [replace(one, message_count=max(one.message_count, 1)) for one in channels]
-    return choose_sources(announced, configuration, vehicle, where=where).pose is None
+    return choose_sources(_announce(channels), configuration, vehicle, where=where).pose is None
+
+
+def _announce(channels: Sequence[ChannelInfo]) -> list[ChannelInfo]:
+    """The channels as if those without messages had as many as any other."""
+    most = max(1, *(one.message_count for one in channels))
+    return [replace(one, message_count=one.message_count or most) for one in channels]
+
+
+def _list_silent(
+    channels: Sequence[ChannelInfo],
+    configuration: Configuration,
+    vehicle: Vehicle,
+    sources: Sources,
+    where: str,
+) -> list[Finding]:
+    """Findings on topics that would be taken for a role if they had messages."""
+    silent = {one.topic for one in channels if one.message_count == 0}
+    if not silent:
+        return []
+    try:
+        announced = choose_sources(_announce(channels), configuration, vehicle, where=where)
+    except ConfigurationError:
+        # With them the log has several robots.
+        return []
+    findings = []
+    for role in ("command", "wheels", "pose", "imu"):
+        first, taken = getattr(announced, role), getattr(sources, role)
+        signals = first.signals if isinstance(first, DriveSource) else [first] if first else []
+        for topic in sorted(silent.intersection(one.topic for one in signals)):
+            values = {"kind": "another" if taken else "none", "topic": topic, "taken": str(taken)}
+            findings.append(Finding("topic_without_messages", "warning", role, values))
+    return findings
 
 
 def _let_wheels_stand_in(chosen: Choice, given: Given) -> Choice:

@@ -1284,6 +1284,12 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "pose_of_another": "{pose} is taken for the pose, and not {other}: what drives the vehicle explains the "
     "one better",
     "topic_left_out": "{where} is left out: {why}",
+    "topic_without_messages": {
+        "none": "{topic} is recorded without any message: by its name and type it may be the {where}, and "
+        "the log has no other",
+        "another": "{topic} is recorded without any message: by its name and type it may be the {where}, "
+        "and {taken} is taken for it",
+    },
     "ground_unobservable": "the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so "
     "that the drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
     "ground does is not observable, and slip in these results is the difference between commanded and "

@@ -553,6 +553,19 @@ def test_a_line_that_keeps_a_misread_log_forbids_names_and_says_what_agrees(
     assert not told & {"command_corrected", "wheels_corrected", "command_scale", "wheelbase_contradicted"}
 
 
+@pytest.mark.parametrize(("silent", "is_told"), [("/amcl_pose", True), ("/goal_pose", False)])
+def test_a_topic_without_any_message_that_would_be_the_pose_is_told(
+    silent: str,
+    is_told: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    log = write_log(tmp_path / "log.mcap", draw(51), silent=silent)
+    setup = set_up_log(log, Options(out=tmp_path))
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "topic_without_messages"]
+    said = "is recorded without any message: by its name and type it may be the pose, and /lio/pose is taken"
+    assert told == [f"{silent} {said} for it"] * is_told
+
+
 def test_a_unit_of_the_wheels_of_an_unknown_vehicle_may_mean_any_radius(tmp_path: Path) -> None:
     options = Options(out=tmp_path, overrides={"wheels": {"unit": "rad/s"}})
     setup = set_up_log(in_rpm(tmp_path / "log.mcap", draw(51)), options)
