@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 
 from pipeline.core import SlipError, format_line, name_first
+from pipeline.recording import MISREAD
 from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.drive import list_joints
@@ -186,7 +187,7 @@ def examine(given: Given) -> Recording:
     """
     _require_joints(given)
     recording = _examine(given)
-    told = [one for one in recording.findings if one.id == "kept_as_recorded"]
+    told = [one for one in recording.findings if one.id in MISREAD]
     doubts = _list_doubts(recording, given)
     lines = _list_readings(given.configuration, _READ_AS)
     pose = recording.configuration.pose
