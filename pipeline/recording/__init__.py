@@ -82,6 +82,7 @@ FAULTS = (
     *MISREAD,
     "wheels_scaled",
     "vehicle_by_motion",
+    "wheelbase_contradicted",
     "signs_contradict",
     "command_reversed",
     "command_of_map",

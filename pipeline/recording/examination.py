@@ -308,6 +308,9 @@ def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
     radii = (radius / _ALIKE, radius * _ALIKE) if given.is_known else RADII_M
     ranges = {"gyro": [(1.0 / _ALIKE, _ALIKE)]}
     doubts |= {("sides", one) for one in recording.unturned}
+    base, turned_by = given.configuration.vehicle.wheelbase_m, recording.geometry.wheelbase
+    if base and turned_by and not 1.0 / _UNLIKE < turned_by.value / base < _UNLIKE:
+        doubts.add(("wheelbase", "vehicle"))
     for one in recording.evidence:
         # A gyro that is upside down is no matter of its unit.
         scale = abs(one.turned) if one.role == "gyro" else one.ahead

@@ -805,9 +805,9 @@ def _contradict_wheelbase(seen: Geometry, kind: str, given: Mapping[str, object]
     base, length = given.get("wheelbase_m"), seen.wheelbase
     if kind != "ackermann" or not isinstance(base, float) or length is None:
         return []
-    if abs(math.log(length.value / base)) < math.log(_ANOTHER_BASE):
-        return []
     low, high = length.interval
+    if abs(math.log(length.value / base)) < math.log(_ANOTHER_BASE) or low < base < high:
+        return []
     values = {"given": base, "value": length.value, "low": low, "high": high}
     return [Finding("wheelbase_contradicted", "warning", "vehicle", values)]
 

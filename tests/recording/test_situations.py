@@ -566,6 +566,16 @@ def test_a_topic_without_any_message_that_would_be_the_pose_is_told(
     assert told == [f"{silent} {said} for it"] * is_told
 
 
+def test_a_unit_of_a_steering_angle_that_a_wheelbase_contradicts_is_named(tmp_path: Path) -> None:
+    drive = draw(51)
+    speed = np.maximum(drive.asked[:, 0], 0.2)
+    car = np.column_stack([speed, np.arctan(1.3 * drive.asked[:, 1] / speed)])
+    given = {"command": {"steering_unit": "deg"}, **OF_A_CAR}
+    log = write_log(tmp_path / "log.mcap", drive, car=car)
+    verdict = format_refusal(set_up_log(log, Options(out=tmp_path, overrides=given)).choice.findings)
+    assert 'gives steering_unit = "deg", which contradicts the other signals' in verdict
+
+
 def test_a_unit_of_the_wheels_of_an_unknown_vehicle_may_mean_any_radius(tmp_path: Path) -> None:
     options = Options(out=tmp_path, overrides={"wheels": {"unit": "rad/s"}})
     setup = set_up_log(in_rpm(tmp_path / "log.mcap", draw(51)), options)
@@ -673,6 +683,7 @@ def test_a_wheelbase_by_which_a_car_does_not_turn_is_told(
     setup = set_up_log(write_log(tmp_path / "log.mcap", drive, car=car), options)
     told = [format_finding(one) for one in setup.choice.findings if one.id == "wheelbase_contradicted"]
     assert len(told) == is_told, setup.choice.recording.geometry
+    assert bool(format_refusal(setup.choice.findings)) == is_told
 
 
 @pytest.mark.parametrize(("spoilt", "share"), [("command", 0.55), ("command", 0.4), ("wheels", 0.55)])
