@@ -187,7 +187,7 @@ def examine(given: Given) -> Recording:
     """
     _require_joints(given)
     recording = _examine(given)
-    told = [one for one in recording.findings if one.id in MISREAD]
+    contradicted = [one for one in recording.findings if one.id in MISREAD]
     doubts = _list_doubts(recording, given)
     lines = _list_readings(given.configuration, _READ_AS)
     pose = recording.configuration.pose
@@ -205,9 +205,9 @@ def examine(given: Given) -> Recording:
     agreeing += [one for one in tried if one.doubts - one.corrected < doubts - one.corrected]
     for role, made in agreeing[0].corrections.items() if agreeing else ():
         values = {"given": agreeing[0].without[role], "instead": made}
-        told.append(Finding("configured_wrongly", "error", role, values))
+        contradicted.append(Finding("configured_wrongly", "error", role, values))
     # Of signals that run.toml reads wrongly, nothing else is said.
-    return replace(recording, findings=tuple(told) or recording.findings)
+    return replace(recording, findings=tuple(contradicted) or recording.findings)
 
 
 def _require_joints(given: Given) -> None:

@@ -261,8 +261,8 @@ class _Chooser:
         """A configured signal, or an error if its topic is not in the log."""
         signal = Signal.parse(text)
         if signal.topic not in self.types:
-            found = "without any message" if signal.topic in self.silent else "not in the log"
-            what = f"the topic {signal.topic!r} configured as {role} is {found}"
+            lack = "without any message" if signal.topic in self.silent else "not in the log"
+            what = f"the topic {signal.topic!r} configured as {role} is {lack}"
             raise self._bad(
                 what, f"The log has: {', '.join(sorted(self.types)) or 'no topics'}.", "topic_not_found"
             )
