@@ -14,7 +14,7 @@ from pipeline.analysis import STAGES, Options
 from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory, round_numbers
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import OVER_BUDGET, Loss
-from pipeline.recording import POSE_FINDINGS, Finding, Given, extract_tables
+from pipeline.recording import MISREAD, POSE_FINDINGS, Finding, Given, extract_tables
 from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, MotionError, read_alignment, read_wheels
 from pipeline.sources import Vehicle, describe_types
@@ -283,7 +283,7 @@ class Work:
         self.write("events", made.events)
         checked: Sequence[Finding] = ()
         # Of signals that run.toml reads wrongly, nothing else is said.
-        if not any(one.id == "configured_wrongly" for one in setup.choice.findings):
+        if not any(one.id in MISREAD for one in setup.choice.findings):
             checked = checks.check_run(
                 velocities,
                 tables,
@@ -395,6 +395,9 @@ def key_stages(
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},
     }
+    # A file that is found beside the log later is told all the same.
+    if files := [one.values["why"] for one in setup.choice.findings if one.id == "file_not_read"]:
+        own["extract"]["files_not_read"] = files
     # A higher limit reads more of the log.
     unread = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
     if unread:

@@ -76,8 +76,13 @@ class LogOptions:
     max_inflated: int | None = None
 
 
+MISREAD = ("configured_wrongly", "kept_as_recorded")
+"""Findings on lines of run.toml that the other signals contradict."""
 FAULTS = (
-    "configured_wrongly",
+    *MISREAD,
+    "wheels_scaled",
+    "vehicle_by_motion",
+    "wheelbase_contradicted",
     "signs_contradict",
     "command_reversed",
     "command_of_map",

@@ -326,10 +326,9 @@ class Case:
             Whether it was applied.
         """
         as_recorded = {**AS_RECORDED[section]} | ({"unit": usual} if usual else {})
-        wrong = {**values, "fault": fault, "value": margin}
-        if self.contradict(section, wrong, change, as_recorded):
+        wrong = {**values, "fault": fault, "value": margin, "line": line}
+        if self._contradict(section, wrong, change, as_recorded):
             return False
-        wrong |= {"line": line}
         if are_apart(halves):
             wrong |= {"halves": list(halves)}
             self.findings.append(Finding("halves_contradict", "warning", section, wrong))
@@ -341,7 +340,7 @@ class Case:
         self.findings.append(Finding(name, "warning", section, wrong))
         return True
 
-    def contradict(
+    def _contradict(
         self,
         section: str,
         wrong: Mapping[str, object],
@@ -352,7 +351,8 @@ class Case:
 
         Args:
             section: of the configuration.
-            wrong: a fault, a key of `pipeline.words.findings.FAULTS`, with the values of its template.
+            wrong: a fault, a key of `pipeline.words.findings.FAULTS`, with the values of its template and the
+                line that would correct it.
             keys: of the section, that would correct it.
             as_recorded: values of keys that keep it as it is recorded.
 

@@ -102,7 +102,7 @@ def measure_command_scale(
         turning = _find_median(driven.asked[1], driven.got[1]) or forward
         return _explain_scale(neutral, (forward, turning), driven, vehicle, body_commanded=body_commanded)
     if abs(np.log(forward)) > _SCALED:
-        return neutral, (_report_wheels(forward, vehicle),)
+        return neutral, (_report_wheels(forward, turning, vehicle),)
     if turning is None or not body_commanded or not _is_multiplied(turning / forward, vehicle):
         return neutral, ()
     used = vehicle.controller_track_multiplier
@@ -112,9 +112,15 @@ def measure_command_scale(
     return replace(neutral, track_multiplier=multiplier), (finding,)
 
 
-def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
-    """Wheels that turn at another speed than commanded where the body does as it is told."""
+def _report_wheels(forward: float, turning: float | None, vehicle: Vehicle) -> Finding:
+    """Wheels that turn at another speed than commanded where the body does as it is told.
+
+    Where their difference is in a smaller ratio, which no controller makes, the vehicle is another one.
+    """
     values = {"value": forward, "radius_m": vehicle.wheel_radius_m}
+    if turning is not None and vehicle.track_width_m and 0.0 < turning < forward * np.exp(-_SCALED):
+        values["track_m"] = vehicle.track_width_m
+        values["other_track_m"] = vehicle.track_width_m * turning / forward
     return Finding("wheels_scaled", "warning", "wheels", values)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 
 from pipeline.core import SlipError, format_line, name_first
+from pipeline.recording import MISREAD
 from pipeline.recording.case import Case, open_case
 from pipeline.recording.command_scale import ask_scale
 from pipeline.recording.drive import list_joints
@@ -175,7 +176,8 @@ def examine(given: Given) -> Recording:
     Where something contradicts the log as run.toml reads it, it is examined without each section's keys for
     units, signs, scales and frames, too, without all of them, and without the joints of the sides. Those
     without which nothing is contradicted that was not before, but for what the log itself corrects in their
-    stead, are wrong, and no radius, gain or wiring is blamed for it.
+    stead, are wrong. They are obeyed, as are those that keep the log as it is recorded where it is corrected
+    without them; all are named, and no radius, gain or wiring is blamed for what they do.
 
     Returns:
         What is in the log; without a pose in it where nothing can stand in for one.
@@ -185,8 +187,15 @@ def examine(given: Given) -> Recording:
     """
     _require_joints(given)
     recording = _examine(given)
+    contradicted = [one for one in recording.findings if one.id in MISREAD]
     doubts = _list_doubts(recording, given)
-    lines = _list_readings(given.configuration, _READ_AS) if doubts else []
+    lines = _list_readings(given.configuration, _READ_AS)
+    pose = recording.configuration.pose
+    if pose != given.configuration.pose and any("pose" in part for part in lines):
+        # In a frame that is corrected, another line says another thing of it.
+        completed = msgspec.structs.replace(given.configuration, pose=pose)
+        doubts |= _list_doubts(_examine(replace(given, configuration=completed)), given)
+    lines = lines if doubts else []
     # Sides that are exchanged are corrected; of wheels that are mixed there is nothing to correct.
     lines += _list_readings(given.configuration, SIDES) if recording.unturned else []
     # Each section alone, and then all: who mistakes a unit does so in both.
@@ -194,16 +203,11 @@ def examine(given: Given) -> Recording:
     tried = [_try_without(given, part) for part in [*lines, *([several] if len(several) > 1 else [])]]
     agreeing = [one for one in tried if one.doubts < doubts]
     agreeing += [one for one in tried if one.doubts - one.corrected < doubts - one.corrected]
-    if not agreeing:
-        return recording
-    best = agreeing[0]
-    return replace(
-        recording,
-        findings=tuple(
-            Finding("configured_wrongly", "error", role, {"given": best.without[role], "instead": made})
-            for role, made in best.corrections.items()
-        ),
-    )
+    for role, made in agreeing[0].corrections.items() if agreeing else ():
+        values = {"given": agreeing[0].without[role], "instead": made}
+        contradicted.append(Finding("configured_wrongly", "error", role, values))
+    # Of signals that run.toml reads wrongly, nothing else is said.
+    return replace(recording, findings=tuple(contradicted) or recording.findings)
 
 
 def _require_joints(given: Given) -> None:
@@ -304,6 +308,9 @@ def _list_doubts(recording: Recording, given: Given) -> set[tuple[str, str]]:
     radii = (radius / _ALIKE, radius * _ALIKE) if given.is_known else RADII_M
     ranges = {"gyro": [(1.0 / _ALIKE, _ALIKE)]}
     doubts |= {("sides", one) for one in recording.unturned}
+    base, turned_by = given.configuration.vehicle.wheelbase_m, recording.geometry.wheelbase
+    if base and turned_by and not 1.0 / _UNLIKE < turned_by.value / base < _UNLIKE:
+        doubts.add(("wheelbase", "vehicle"))
     for one in recording.evidence:
         # A gyro that is upside down is no matter of its unit.
         scale = abs(one.turned) if one.role == "gyro" else one.ahead

@@ -12,7 +12,7 @@ from pipeline.recording import LogOptions
 from pipeline.recording.clocks import find_pauses
 from pipeline.recording.findings import Finding
 from pipeline.recording.log_choice import Choice, choose, make_stand_in
-from pipeline.recording.log_setup import report_unused, require_messages, require_sources
+from pipeline.recording.log_setup import list_unread_files, report_unused, require_messages, require_sources
 from pipeline.recording.tape import measure_by_tape
 from pipeline.sources import (
     UNKNOWN_VEHICLE,
@@ -117,7 +117,7 @@ def inspect_log(path: Path, options: LogOptions) -> Inspection:
         Finding("repeated_messages", "warning", topic, {"kind": "ignored", "count": count})
         for topic, count in data.repeated.items()
     ]
-    notes += measure_by_tape(index, configuration, choice)
+    notes += [*measure_by_tape(index, configuration, choice), *list_unread_files(index.path, options)]
     duration_s = index.duration_s - sum(lengths_ns) / 1e9
     return Inspection(index, topics, data.losses, tuple(notes), choice, problem, data.unchecked, duration_s)
 

@@ -14,7 +14,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -303,16 +302,18 @@ def _choose_readable(
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
         sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
-    findings += beside
+    findings += [*_list_silent(channels, configuration, vehicle, sources, where), *beside]
     findings += [
         Finding("vehicle_choice", "info", "vehicle", note)
         for note in (recognized.notes if recognized else ())
     ]
     recorded = find_preset(index.deployment.get("vehicle") or "")
     witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
-    findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
+    contradiction = next(_list_contradictions(witnesses, vehicle, source), None)
+    findings += [contradiction[0]] if contradiction else []
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     chosen = _choose_pose(chosen, channels, index, configuration)
+    chosen = _settle_by_motion(chosen, *contradiction) if contradiction else chosen
     taken = chosen.sources
     if taken.command is None and taken.wheels is not None and taken.pose is not None:
         finding = Finding("no_command", "info", "command")
@@ -364,8 +365,39 @@ def _lacks_pose(
     """
     if sources.command is None or sources.wheels is None:
         return False
-    announced = [replace(one, message_count=max(one.message_count, 1)) for one in channels]
-    return choose_sources(announced, configuration, vehicle, where=where).pose is None
+    return choose_sources(_announce(channels), configuration, vehicle, where=where).pose is None
+
+
+def _announce(channels: Sequence[ChannelInfo]) -> list[ChannelInfo]:
+    """The channels as if those without messages had as many as any other."""
+    most = max(1, *(one.message_count for one in channels))
+    return [replace(one, message_count=one.message_count or most) for one in channels]
+
+
+def _list_silent(
+    channels: Sequence[ChannelInfo],
+    configuration: Configuration,
+    vehicle: Vehicle,
+    sources: Sources,
+    where: str,
+) -> list[Finding]:
+    """Findings on topics that would be taken for a role if they had messages."""
+    silent = {one.topic for one in channels if one.message_count == 0}
+    if not silent:
+        return []
+    try:
+        announced = choose_sources(_announce(channels), configuration, vehicle, where=where)
+    except ConfigurationError:
+        # With them the log has several robots.
+        return []
+    findings = []
+    for role in ("command", "wheels", "pose", "imu"):
+        first, taken = getattr(announced, role), getattr(sources, role)
+        signals = first.signals if isinstance(first, DriveSource) else [first] if first else []
+        for topic in sorted(silent.intersection(one.topic for one in signals)):
+            values = {"kind": "another" if taken else "none", "topic": topic, "taken": str(taken)}
+            findings.append(Finding("topic_without_messages", "warning", role, values))
+    return findings
 
 
 def _let_wheels_stand_in(chosen: Choice, given: Given) -> Choice:
@@ -516,8 +548,8 @@ def _apply_controller(
 
 def _list_contradictions(
     witnesses: Sequence[Recognized], vehicle: Vehicle, source: VehicleSource
-) -> Iterator[Finding]:
-    """Findings on a chosen vehicle that what the log shows, or says of itself, contradicts."""
+) -> Iterator[tuple[Finding, Vehicle]]:
+    """Findings on a chosen vehicle that what the log shows or says contradicts, each with that vehicle."""
     for one in witnesses:
         differing = list_contradictions(one.vehicle, vehicle)
         is_given = source in {"flag", "configuration", "metadata"} and source != one.source
@@ -529,7 +561,41 @@ def _list_contradictions(
                 "vehicle": vehicle.name,
                 "is_flag": source == "flag",
             }
-            yield Finding("vehicle_contradiction", "warning", "vehicle", values)
+            yield Finding("vehicle_contradiction", "warning", "vehicle", values), one.vehicle
+
+
+_SAME_RADIUS = 1.3
+"""Ratio of the radius by the motion to that of a vehicle, up to which wheels may have it and slip."""
+
+
+def _settle_by_motion(chosen: Choice, contradiction: Finding, other: Vehicle) -> Choice:
+    """The choice, with a finding where wheels roll as those of the vehicle that the log indicates alone."""
+    recording, stated = chosen.recording, chosen.vehicle.wheel_radius_m
+    if recording is None:
+        return chosen
+    for one in recording.evidence:
+        drive = getattr(chosen.sources, one.role, None)
+        if not isinstance(drive, DriveSource) or drive.form not in {DriveForm.JOINTS, DriveForm.SIDES}:
+            continue
+        section = getattr(recording.configuration, one.role)
+        if not one.ahead or section.unit not in {None, "rad/s"} or section.scale is not None:
+            continue
+        fits = [
+            radius is not None and abs(math.log(abs(one.ahead) / radius)) < math.log(_SAME_RADIUS)
+            for radius in (stated, other.wheel_radius_m)
+        ]
+        if fits == [False, True]:
+            values = {
+                "source": contradiction.values["source"],
+                "indicated": other.name,
+                "vehicle": chosen.vehicle.name,
+                "is_flag": chosen.vehicle_source == "flag",
+                "value": abs(one.ahead),
+                "radius_m": stated,
+            }
+            finding = Finding("vehicle_by_motion", "error", "vehicle", values)
+            return replace(chosen, findings=(*chosen.findings, finding))
+    return chosen
 
 
 def _compare(chosen: Choice, given: Given) -> Choice:
@@ -739,9 +805,9 @@ def _contradict_wheelbase(seen: Geometry, kind: str, given: Mapping[str, object]
     base, length = given.get("wheelbase_m"), seen.wheelbase
     if kind != "ackermann" or not isinstance(base, float) or length is None:
         return []
-    if abs(math.log(length.value / base)) < math.log(_ANOTHER_BASE):
-        return []
     low, high = length.interval
+    if abs(math.log(length.value / base)) < math.log(_ANOTHER_BASE) or low < base < high:
+        return []
     values = {"given": base, "value": length.value, "low": low, "high": high}
     return [Finding("wheelbase_contradicted", "warning", "vehicle", values)]
 

@@ -28,6 +28,7 @@ from pipeline.sources import (
     Signal,
     Sources,
     Vehicle,
+    explain_unread,
     find_pose_fields,
     find_type,
     load_configuration,
@@ -95,18 +96,25 @@ def set_up_log(path: Path, options: LogOptions) -> LogSetup:
     recorded = index.deployment
     require_messages(index)
     _require_elements(index, configuration)
+    unread = list_unread_files(path, options)
     try:
         chosen, configuration = _choose(index, configuration, options)
     except SlipError as error:
-        raise add_lengths(error, measure_by_tape(index, configuration)) from None
+        raise add_lengths(error, [*unread, *measure_by_tape(index, configuration)]) from None
     by_tape = measure_by_tape(index, configuration, chosen)
-    chosen = replace(chosen, findings=(*chosen.findings, *by_tape))
+    chosen = replace(chosen, findings=(*unread, *chosen.findings, *by_tape))
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
     return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+
+
+def list_unread_files(path: Path, options: LogOptions) -> list[Finding]:
+    """A finding on files beside a log that look like its configuration, and are not read; else nothing."""
+    why = "" if options.config else explain_unread(path)
+    return [Finding("file_not_read", "warning", "log", {"why": why})] if why else []
 
 
 def _require_elements(index: LogIndex, configuration: Configuration) -> None:

@@ -39,10 +39,12 @@ _MOST = 0.5
 
 
 def ask_tracks(case: Case) -> Case:
-    """Of poses that alternate between two tracks, those of the one that what drives the vehicle explains."""
+    """Of poses that alternate between two tracks, those of the one that what drives the vehicle explains.
+
+    One that the user names is obeyed, and told where the other is the vehicle's.
+    """
     pose = case.sources.pose
-    tracks = None if pose is None or pose.track else case.extraction.find_tracks()
-    if pose is None or tracks is None:
+    if pose is None or case.extraction.find_tracks() is None:
         return case
     drives = {"command": case.sources.command, "wheels": case.sources.wheels}
     readings = [case.read(one, is_measured=role == "wheels") for role, one in drives.items() if one]
@@ -55,6 +57,11 @@ def ask_tracks(case: Case) -> Case:
     (less, _), (most, by) = sorted(shares)
     why = "both" if less > _UNLIKE * most else "told" if most else "neither"
     number = 1 + shares.index(max(shares))
+    if pose.track:
+        if why == "told" and number != pose.track:
+            wrong = {"given": {"track": pose.track}, "instead": [f"track = {number}"]}
+            case.findings.append(Finding("configured_wrongly", "error", "pose", wrong))
+        return case
     values = {
         "kind": why,
         "frames": [*case.extraction.frames] if all(case.extraction.frames) else [],

@@ -11,7 +11,7 @@ from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reverse
 from pipeline.recording.findings import Finding
 from pipeline.recording.motion import CLEAR, LEAST_NATS, compare, fit, measure_motion, measure_share
 from pipeline.recording.readings import DELAYS_S, Reading
-from pipeline.sources import AS_RECORDED, PoseContent
+from pipeline.sources import PoseContent
 
 _HALF_TURN = 180.0
 _CHANGES: Mapping[str, Mapping[str, object]] = {
@@ -31,10 +31,6 @@ def ask_frame(case: Case) -> Case:
         values = {"kind": "heading", "value": other_deg, "source": str(source)}
         case.findings.append(Finding("pose_undecided", "warning", "pose", values))
     if not margin:
-        return case
-    about = {"fault": "heading by motion", "source": str(source), "offset_deg": turned.offset_deg}
-    about["value"] = margin
-    if turned.offset_deg and case.contradict("pose", about, ["heading_deg"], AS_RECORDED["pose"]):
         return case
     if turned.flip:
         flipped = {"value": margin, "source": str(source)}
@@ -131,7 +127,7 @@ def _report_signs(case: Case) -> None:
                 up, offset = up.removeprefix("-") if up.startswith("-") else f"-{up}", -offset
             else:
                 _report_fault(case, fault)
-    _report_frame(case, up, 180.0 - (180.0 - offset) % 360.0, signs)
+    _report_frame(case, up, _wrap(offset), signs)
 
 
 def rate_map_axes(reading: Reading) -> float:
@@ -181,8 +177,13 @@ def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axi
     if offset:
         fault = "looks to the rear" if abs(offset) == _HALF_TURN else "heading off"
         off = {"source": str(source), "offset_deg": offset, "witnesses": drivers}
-        line = f"heading_deg = {offset:g}"
-        case.correct("pose", fault, off, line, {"heading_deg": float(f"{offset:g}")})
+        heading = float(f"{_wrap(offset + (case.configuration.pose.heading_deg or 0.0)):g}")
+        case.correct("pose", fault, off, f"heading_deg = {heading:g}", {"heading_deg": heading})
+
+
+def _wrap(degrees: float) -> float:
+    """An angle above -180 degrees, and up to 180."""
+    return _HALF_TURN - (_HALF_TURN - degrees) % 360.0
 
 
 def _report_fault(case: Case, fault: str, others: Sequence[str] = ()) -> None:

@@ -161,14 +161,16 @@ def _contradict(
     return [Finding("tape_contradicts_vehicle", "warning", "vehicle", said)]
 
 
-def add_lengths(error: SlipError, by_tape: Sequence[Finding]) -> SlipError:
-    """The refusal of a log with the lengths that a tape shows all the same."""
+def add_lengths(error: SlipError, known: Sequence[Finding]) -> SlipError:
+    """The refusal of a log with the lengths that a tape shows all the same, and files that are not read."""
     hint = ""
-    for one in by_tape:
+    for one in known:
         if one.values.get("line"):
             hint += f" By what was measured by hand, {one.values['line']} in run.toml."
         elif one.id == "no_length_by_tape":
             hint += f" {_REFUSED[one.values['kind']]}."
+        elif one.id == "file_not_read":
+            hint += f" {one.values['why']}."
     return type(error)(error.code, error.what, where=error.where, hint=f"{error.hint}{hint}")
 
 

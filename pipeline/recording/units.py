@@ -54,7 +54,8 @@ def ask_gyro(case: Case) -> Case:
 def ask_metres(case: Case) -> Case:
     """The unit of the positions."""
     source, motion = case.sources.pose, case.motion
-    if source is None or source.content is not PoseContent.POSE or case.configuration.pose.unit:
+    is_open = case.configuration.pose.unit in {None, "m"}
+    if source is None or source.content is not PoseContent.POSE or not is_open:
         return case
     drives = {
         drive.reading.form: drive.reading
@@ -79,7 +80,7 @@ def resolve_steering(case: Case, drive: Candidate) -> Candidate:
     """Read a steering angle in the unit in which the body turns by it; which one it is is told later."""
     reading = drive.reading
     section = case.find_section(drive.source, is_measured=drive.is_measured)
-    is_free = drive.source.form is DriveForm.STEERING and section.steering_unit is None
+    is_free = drive.source.form is DriveForm.STEERING and section.steering_unit in {None, *USUAL}
     if not is_free or drive.source.signals[1].unit or not isinstance(reading.second, Bent):
         return drive
     degrees = replace(reading, second=reading.second.rescale(np.pi / 180.0)).fitted(case.motion)
@@ -270,7 +271,10 @@ def _correct_wheel_unit(
     role: str = "wheels",
 ) -> None:
     """Correct the unit of wheel speeds, unless the type or the user gives it; see `find_wheel_unit`."""
-    if wheels.source.signals[0].unit or getattr(case.configuration, role).unit is not None:
+    given = getattr(case.configuration, role).unit
+    # Of an unknown vehicle a stated unit may mean any radius.
+    is_settled = given is not None and (given != "rad/s" or radius is None)
+    if wheels.source.signals[0].unit or is_settled:
         return
     unit = find_wheel_unit(gain, share, str(wheels.source), radius, turn)
     values: dict[str, object] = {"source": str(wheels.source), "unit": unit}

@@ -534,7 +534,9 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     # first one are unknown.
     ends = min(float(streams[0]), times[0]) - 0.05, max(streams[-1], times[-1]) + 0.05
     known = np.concatenate((ends[:1], times, ends[1:]))
-    holes = np.flatnonzero(np.diff(known) > 0.2 + ROUNDING_S)
+    # Rows of any rate are next to each other.
+    apart = max(0.2, 1.5 * float(np.median(np.diff(times)))) if times.size > 1 else 0.2
+    holes = np.flatnonzero(np.diff(known) > apart + ROUNDING_S)
     for hole in holes.tolist():
         # Nothing is scored far from all streams either, however long they are silent.
         first, last = known[hole] + 0.05, known[hole + 1] - ROUNDING_S

@@ -71,6 +71,7 @@ else:
                 "is_model",
                 "match_globs",
                 "list_configuration_files",
+                "explain_unread",
                 "load_configuration",
                 "merge",
             ),

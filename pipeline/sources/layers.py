@@ -9,7 +9,15 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from pipeline.core import TomlError, objects_in, parse_toml, read_bounded_text, require_finite, shorten
+from pipeline.core import (
+    TomlError,
+    name_first,
+    objects_in,
+    parse_toml,
+    read_bounded_text,
+    require_finite,
+    shorten,
+)
 from pipeline.logs import RemotePath, stem_of
 from pipeline.sources.configuration import (
     Configuration,
@@ -289,6 +297,48 @@ def list_configuration_files(
     files += [] if fleet is None else [fleet]
     own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
     return (*files, *(own if given is None else [given]))
+
+
+def explain_unread(log: Path) -> str:
+    """Which files beside a log, or in it, look like its configuration and are not read, and what to do.
+
+    They hold sections of `run.toml`, or its name in other letters, and have the name of no other log there.
+
+    Returns:
+        One clause; empty where there are none.
+    """
+    path = _follow(log)
+    if isinstance(path, RemotePath):
+        return ""
+    read = list_configuration_files(log)
+    unread = []
+    for folder in (path.parent, *([path] if path.is_dir() else [])):
+        files = sorted(folder.iterdir()) if os.access(folder, os.R_OK) else []
+        others = {
+            stem_of(one) for one in files if folder != path and one.suffix.lower() != ".toml" and one != path
+        }
+        for file in files:
+            is_own = file.suffix.lower() == ".toml" and file.stem not in others and file.is_file()
+            if is_own and not any(file.samefile(one) for one in read) and _is_configuration(file):
+                unread.append(file.name)
+    if not unread:
+        return ""
+    name = RUN_FILE if path.is_dir() else f"{RUN_FILE} or {stem_of(log)}.toml"
+    verb, it = ("is", "it") if len(unread) == 1 else ("are", "one of them")
+    return f"{name_first(unread)} beside the log {verb} not read: name {it} {name}, or give it with --config"
+
+
+def _is_configuration(file: Path) -> bool:
+    """Whether a file has the name of those that are read in other letters, or has their sections."""
+    if file.name.lower() == RUN_FILE:
+        return True
+    if file.name == FLEET_FILE or is_model(file) or is_model(file, _PLAN):
+        return False
+    try:
+        sections = read_toml(file).items()
+    except ConfigurationError:
+        return False
+    return any(key in Configuration.__struct_fields__ and isinstance(one, dict) for key, one in sections)
 
 
 def _follow(log: Path) -> Path:

@@ -184,7 +184,8 @@ def choose_sources(
     chosen = {*list_topics(configuration.command), *list_topics(configuration.wheels)}
     misnamed = {topic: what for topic, what in vehicle.topics.misnamed.items() if topic not in chosen}
     held = [channel for channel in channels if channel.message_count != 0]
-    chooser = _Chooser([channel for channel in held if channel.topic not in misnamed], vehicle, where)
+    silent = {channel.topic for channel in channels} - {channel.topic for channel in held}
+    chooser = _Chooser([channel for channel in held if channel.topic not in misnamed], silent, vehicle, where)
     chooser.notes += [
         f"{channel.topic} is left out: it contains {misnamed[channel.topic]}"
         for channel in held
@@ -208,9 +209,12 @@ def choose_sources(
 class _Chooser:
     """Candidates of one log."""
 
-    def __init__(self, channels: list[ChannelInfo], vehicle: Vehicle, where: str) -> None:
+    def __init__(
+        self, channels: list[ChannelInfo], silent: Collection[str], vehicle: Vehicle, where: str
+    ) -> None:
         self.types = {topic: plain_type(kind) for topic, kind in find_types(channels).items()}
         self.counts = {channel.topic: channel.message_count or 0 for channel in channels}
+        self.silent = silent
         self.vehicle = vehicle
         self.where = where
         self.notes: list[str] = []
@@ -257,9 +261,10 @@ class _Chooser:
         """A configured signal, or an error if its topic is not in the log."""
         signal = Signal.parse(text)
         if signal.topic not in self.types:
-            what = f"the topic {signal.topic!r} configured as {role} is not in the log (or is empty)"
+            lack = "without any message" if signal.topic in self.silent else "not in the log"
+            what = f"the topic {signal.topic!r} configured as {role} is {lack}"
             raise self._bad(
-                what, f"It has: {', '.join(sorted(self.types)) or 'no topics'}.", "topic_not_found"
+                what, f"The log has: {', '.join(sorted(self.types)) or 'no topics'}.", "topic_not_found"
             )
         return signal
 

@@ -614,10 +614,14 @@ def _controller_multiplier(of: Values) -> str:
 
 def _wheels_scaled(of: Values) -> str:
     times, radius = of["value"], of["radius_m"]
+    seen = f"in slow driving the wheels turn {times:.2f} times as fast as commanded, and the body moves as "
+    other = f"radius is {radius / times:.3g} m and not {radius:.3g} m"
+    if "track_m" in of:
+        track = f"the track is {of['other_track_m']:.3g} m and not {of['track_m']:.3g} m"
+        return f"{seen}commanded: the wheels' {other}, and {track}: name another vehicle (--vehicle)"
     return (
-        f"in slow driving the wheels turn {times:.2f} times as fast as commanded, and the body moves as "
-        f"commanded: their readings are {times:.2f} times what they should be (scale = {1.0 / times:.3g} "
-        f"under [wheels] in run.toml), or their radius is {radius / times:.3g} m and not {radius:.3g} m"
+        f"{seen}commanded: their readings are {times:.2f} times what they should be "
+        f"(scale = {1.0 / times:.3g} under [wheels] in run.toml), or their {other}"
     )
 
 
@@ -739,6 +743,15 @@ def _vehicle_contradiction(of: Values) -> str:
     return (
         f"the {_name_source(of['source'])} of the log indicates a {of['indicated']} "
         f"({', '.join(of['differing'])}), but {named}"
+    )
+
+
+def _vehicle_by_motion(of: Values) -> str:
+    given = "--vehicle" if of["is_flag"] else "[vehicle]"
+    return (
+        f"by the motion the wheels have a radius of {of['value']:.3g} m, as those of the {of['indicated']} "
+        f"that the {_name_source(of['source'])} of the log indicates, and not {of['radius_m']:.3g} m, as "
+        f"those of the {of['vehicle']} that is stated: correct {given}"
     )
 
 
@@ -991,8 +1004,6 @@ FAULTS: Mapping[str, Template] = {
     "other topics do not: its clock runs ahead",
     "axis up": _axis_up,
     "heading off": _heading_off,
-    "heading by motion": "by the motion the heading of {source} is {offset_deg:.0f} degrees off (or as much "
-    "less half a turn)",
     "looks to the rear": _looks_to_the_rear,
     "late stamps": _late_stamps,
     "gyro in degrees": "the gyro of {gyro} is in degrees per second",
@@ -1010,9 +1021,10 @@ def _corrected(of: Values) -> str:
     return f"{fault}: corrected, as {of['line']} under [{of['where']}] in run.toml does{otherwise}"
 
 
-def _configured(of: Values, rest: str) -> str:
+def _configured(of: Values, taken: str = "") -> str:
     fault, given = _fill(FAULTS[of["fault"]], of), enumerate_texts(of["given"])
-    return f"{fault}, but [{of['where']}] in run.toml gives {given}{rest}"
+    instead = f"{of['line']} in its place agrees with the other signals"
+    return f"{fault}, but [{of['where']}] in run.toml gives {given}{taken}: {instead}"
 
 
 def _configured_wrongly(of: Values) -> str:
@@ -1264,6 +1276,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     },
     "no_readable_text": _no_readable_text,
     "vehicle_contradiction": _vehicle_contradiction,
+    "vehicle_by_motion": _vehicle_by_motion,
     "numbers_not_used": "not used: {what}",
     "odometry_contradicts_itself": {"pose": _contradicts_itself, "speeds": _contradicts_itself},
     "pose_contradicts_itself": "the pose of {source} is wrong, and nothing else shows the motion: no other "
@@ -1271,6 +1284,12 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     "pose_of_another": "{pose} is taken for the pose, and not {other}: what drives the vehicle explains the "
     "one better",
     "topic_left_out": "{where} is left out: {why}",
+    "topic_without_messages": {
+        "none": "{topic} is recorded without any message: by its name and type it may be the {where}, and "
+        "the log has no other",
+        "another": "{topic} is recorded without any message: by its name and type it may be the {where}, "
+        "and {taken} is taken for it",
+    },
     "ground_unobservable": "the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so "
     "that the drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
     "ground does is not observable, and slip in these results is the difference between commanded and "
@@ -1294,7 +1313,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
     },
     "configured_wrongly": _configured_wrongly,
     "signs_contradict": {
-        "configured": partial(_configured, rest=": correct it"),
+        "configured": _configured,
         "command and wheels": _command_against_wheels,
         "signal and poses": _signal_against_poses,
     },
@@ -1319,7 +1338,7 @@ _RECORDING: Mapping[str, Template | Mapping[str, Template]] = {
         'clearly: z is taken to point up, as usual (up = "{axis}", or "-{axis}", under [pose] in run.toml '
         'takes another axis, up = "z" settles it)',
     },
-    "kept_as_recorded": partial(_configured, rest=", and it is taken as it is recorded"),
+    "kept_as_recorded": partial(_configured, taken=", and it is taken as it is recorded"),
     "pose_flipped": "the headings of {source} turn against its own path: its frame is of the other hand; "
     "correct what publishes it",
     "command_of_map": "the commands of {source} are along the axes of a map, and the base turns them by its "
@@ -1422,6 +1441,7 @@ _DIAGNOSIS: Mapping[str, Template | Mapping[str, Template]] = {
     "quarantine_{where}",
     "log_note": "{note}",
     "log_unchecked": "{why}",
+    "file_not_read": "{why}",
     "repeated_messages": {
         "removed": "{count} messages of {where} are byte-for-byte copies of others: duplicates were removed",
         "ignored": "{count} messages of {where} are byte-for-byte copies of others: duplicates are ignored",

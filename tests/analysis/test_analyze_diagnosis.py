@@ -9,7 +9,9 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.estimation import stored_diagnosis
+from pipeline.estimation import Input, stored_diagnosis
+from pipeline.estimation.estimation_data import prepare_data
+from pipeline.estimation.recordings import load_recording
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.simulate import make_scenario, simulate_case, simulate_run, write_log
 from pipeline.words.objects import diagnosis_as_json
@@ -92,3 +94,21 @@ def test_a_new_effect_asks_for_a_new_diagnosis(tmp_path: Path, monkeypatch: pyte
     assert stored_diagnosis.key_diagnosis({"slip": "key"}) == before
     (folder / "new_effect.py").touch()
     assert stored_diagnosis.key_diagnosis({"slip": "key"}) != before
+
+
+def test_a_diagnosis_does_not_depend_on_the_rate_of_the_slip_table(samples: Path, tmp_path: Path) -> None:
+    """Rows of a slow table lie next to each other, and are no holes of the drive."""
+    counts = []
+    for rate in (20, 2):
+        options = Options(
+            out=tmp_path / str(rate),
+            report=False,
+            diagnosis=False,
+            overrides={"velocity": {"rate_hz": rate}},
+        )
+        manifest = analyze_log(samples / "husky_tile.mcap", options).manifest
+        vehicle, recording = stored_diagnosis.read_recording(manifest)
+        counts.append(
+            prepare_data([load_recording(recording, vehicle)], vehicle, Input.COMMAND).whole.run.size
+        )
+    assert counts[1] == pytest.approx(counts[0], rel=0.02)

@@ -3,9 +3,13 @@
 from pathlib import Path
 
 import pytest
+from drawn_motion import draw
+from written_logs import write_log
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
+from pipeline.core import SlipError
+from pipeline.recording.log_setup import set_up_log
 from pipeline.results import read_findings
 from pipeline.words.findings import format_finding
 
@@ -53,6 +57,26 @@ def test_the_same_mistake_in_two_sections_is_named_in_both(tmp_path: Path) -> No
     both = 'unit = "rpm"\n[wheels]\nunit = "rpm"'
     told = [one for one in find_what_is_told(tmp_path, "command", both, 2) if "contradicts" in one]
     assert [one.partition(" in run.toml")[0] for one in told] == ["[command]", "[wheels]"]
+
+
+def test_a_file_that_is_not_read_is_told_of_a_log_that_was_analyzed_before(tmp_path: Path) -> None:
+    (tmp_path / LOG.name).write_bytes(LOG.read_bytes())
+    options = Options(out=tmp_path / "results", report=False, diagnosis=False)
+    for is_there in (False, True):
+        if is_there:
+            (tmp_path / "Run.toml").touch()
+        findings = read_findings(analyze_log(tmp_path / LOG.name, options).summary)
+        told = [format_finding(one) for one in findings if one.id == "file_not_read"]
+        assert [one.partition(":")[0] for one in told] == ["Run.toml beside the log is not read"] * is_there
+
+
+def test_a_log_that_is_refused_tells_which_file_is_not_read(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.mcap", draw(51), is_measured=False)
+    (tmp_path / "Run.toml").touch()
+    options = Options(out=tmp_path / "results", inputs=("measured",))
+    with pytest.raises(SlipError) as refused:
+        set_up_log(log, options)
+    assert "Run.toml beside the log is not read: name it run.toml" in refused.value.hint
 
 
 @pytest.mark.parametrize("section", ["wheels", "imu"])

@@ -124,6 +124,12 @@ def test_of_two_publishers_of_poses_the_one_that_follows_the_command_is_taken(
     assert ("odom -> base_link" in text) == ("tf2" in kind)
     other = extract_drawn(log, pose={"track": 3 - number})
     np.testing.assert_allclose(other["x"], bodies[2 - number].x, atol=1e-9)
+    told = read_findings(log, pose={"track": 3 - number})["configured_wrongly"]
+    assert (
+        f"[pose] in run.toml (or in a fleet.toml above it) gives track = {3 - number}, which contradicts"
+        in told
+    )
+    assert f"without it track = {number} is found" in told
 
 
 def test_two_tracks_that_both_follow_the_command_are_told_and_nothing_is_estimated(tmp_path: Path) -> None:

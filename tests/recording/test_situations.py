@@ -18,7 +18,7 @@ from pipeline.core import Floats, SlipError
 from pipeline.recording.inspection import inspect_log
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.recording.readings import Held, Reading
-from pipeline.words import format_finding
+from pipeline.words import format_finding, format_refusal
 
 
 def change(wheels: Reading, by: Callable[[Floats], Floats], *, exchanged: bool = False) -> Reading:
@@ -509,6 +509,125 @@ def test_a_unit_that_keeps_a_log_as_recorded_is_obeyed_and_told(
     assert any('unit = "rad/s", and it is taken as it is recorded' in one for one in told)
 
 
+def turned(path: Path, drive: Drive) -> Path:
+    """A heading that is off by a quarter turn."""
+    return write_log(path, replace(drive, yaw=drive.yaw - 0.5 * np.pi))
+
+
+def in_rpm(path: Path, drive: Drive) -> Path:
+    return write_log(path, drive, wheels=change(sides(drive), lambda speed: speed * 30.0 / np.pi))
+
+
+def steered_in_degrees(path: Path, drive: Drive) -> Path:
+    speed = np.maximum(drive.asked[:, 0], 0.2)
+    angle = np.degrees(np.arctan(1.3 * drive.asked[:, 1] / speed))
+    return write_log(path, drive, car=np.column_stack([speed, angle]))
+
+
+OF_A_CAR = {"vehicle": {"kind": "ackermann", "wheelbase_m": 1.3}}
+OF_TWO_SIDES = {"vehicle": {"wheel_radius_m": 0.1, "track_width_m": 0.5}}
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "instead"),
+    [
+        (turned, {"pose": {"heading_deg": 0}}, "heading_deg = 90"),
+        (in_millimetres, {"pose": {"unit": "m"}}, 'unit = "mm"'),
+        (in_centimetres, {"pose": {"unit": "m"}}, 'unit = "cm"'),
+        (in_rpm, {"wheels": {"unit": "rad/s"}, **OF_TWO_SIDES}, 'unit = "rpm"'),
+        (steered_in_degrees, {"command": {"steering_unit": "rad"}, **OF_A_CAR}, 'steering_unit = "deg"'),
+    ],
+)
+def test_a_line_that_keeps_a_misread_log_forbids_names_and_says_what_agrees(
+    make: Callable[[Path, Drive], Path], given: dict[str, dict[str, object]], instead: str, tmp_path: Path
+) -> None:
+    setup = set_up_log(make(tmp_path / "log.mcap", draw(51)), Options(out=tmp_path, overrides=given))
+    section, keys = next(iter(given.items()))
+    for key, value in keys.items():
+        assert getattr(getattr(setup.configuration, section), key) == value
+    verdict = format_refusal(setup.choice.findings)
+    assert f"[{section}] in run.toml gives" in verdict
+    assert f"{instead} in its place agrees with the other signals" in verdict
+    assert verdict.endswith("No effect can be estimated.")
+    told = {one.id for one in setup.choice.findings}
+    assert not told & {"command_corrected", "wheels_corrected", "command_scale", "wheelbase_contradicted"}
+
+
+@pytest.mark.parametrize(("silent", "is_told"), [("/amcl_pose", True), ("/goal_pose", False)])
+def test_a_topic_without_any_message_that_would_be_the_pose_is_told(
+    silent: str,
+    is_told: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    log = write_log(tmp_path / "log.mcap", draw(51), silent=silent)
+    setup = set_up_log(log, Options(out=tmp_path))
+    told = [format_finding(one) for one in setup.choice.findings if one.id == "topic_without_messages"]
+    said = "is recorded without any message: by its name and type it may be the pose, and /lio/pose is taken"
+    assert told == [f"{silent} {said} for it"] * is_told
+
+
+def test_a_unit_of_a_steering_angle_that_a_wheelbase_contradicts_is_named(tmp_path: Path) -> None:
+    drive = draw(51)
+    speed = np.maximum(drive.asked[:, 0], 0.2)
+    car = np.column_stack([speed, np.arctan(1.3 * drive.asked[:, 1] / speed)])
+    given = {"command": {"steering_unit": "deg"}, **OF_A_CAR}
+    log = write_log(tmp_path / "log.mcap", drive, car=car)
+    verdict = format_refusal(set_up_log(log, Options(out=tmp_path, overrides=given)).choice.findings)
+    assert 'gives steering_unit = "deg", which contradicts the other signals' in verdict
+
+
+def test_a_unit_of_the_wheels_of_an_unknown_vehicle_may_mean_any_radius(tmp_path: Path) -> None:
+    options = Options(out=tmp_path, overrides={"wheels": {"unit": "rad/s"}})
+    setup = set_up_log(in_rpm(tmp_path / "log.mcap", draw(51)), options)
+    assert not format_refusal(setup.choice.findings)
+    assert setup.vehicle.wheel_radius_m == pytest.approx(0.1 * np.pi / 30.0, rel=0.03)
+
+
+def test_a_heading_is_read_in_the_frame_that_is_corrected(tmp_path: Path) -> None:
+    """Of poses with y up, a heading that says nothing about z says something about y."""
+    drive = draw(51)
+    log = write_log(tmp_path / "log.mcap", drive, up="y")
+    for heading, told in ((0, "pose_turned"), (90, "configured_wrongly")):
+        options = Options(out=tmp_path, overrides={"pose": {"heading_deg": heading}})
+        ids = {one.id for one in set_up_log(log, options).choice.findings}
+        assert told in ids
+
+
+@pytest.mark.parametrize(
+    ("radius", "track", "said"),
+    [(0.3, 0.5, "scale = 0.333 under [wheels]"), (0.3, 1.08, "the track is 0.5 m and not 1.08 m")],
+)
+def test_lengths_of_another_vehicle_forbid_names(
+    radius: float, track: float, said: str, tmp_path: Path
+) -> None:
+    given = {"vehicle": {"wheel_radius_m": radius, "track_width_m": track}}
+    log = write_log(tmp_path / "log.mcap", draw(51))
+    verdict = format_refusal(set_up_log(log, Options(out=tmp_path, overrides=given)).choice.findings)
+    assert said in verdict
+    assert ("scale = " in verdict) == (track == 0.5)
+
+
+@pytest.mark.parametrize(
+    ("log", "given", "is_told"),
+    [
+        ("husky_tile", "warthog", True),
+        ("husky_tile", "husky_a200", False),
+        ("warthog_ice", "husky_a200", True),
+        ("warthog_ice", "warthog", False),
+    ],
+)
+def test_a_preset_whose_wheels_do_not_roll_so_forbids_names(
+    log: str,
+    given: str,
+    is_told: bool,  # noqa: FBT001
+    samples: Path,
+    tmp_path: Path,
+) -> None:
+    options = Options(out=tmp_path, overrides={"vehicle": {"preset": given}})
+    verdict = format_refusal(set_up_log(samples / f"{log}.mcap", options).choice.findings)
+    assert ("that is stated: correct" in verdict) == is_told
+
+
 @pytest.mark.parametrize(
     ("given", "what"),
     [
@@ -564,6 +683,7 @@ def test_a_wheelbase_by_which_a_car_does_not_turn_is_told(
     setup = set_up_log(write_log(tmp_path / "log.mcap", drive, car=car), options)
     told = [format_finding(one) for one in setup.choice.findings if one.id == "wheelbase_contradicted"]
     assert len(told) == is_told, setup.choice.recording.geometry
+    assert bool(format_refusal(setup.choice.findings)) == is_told
 
 
 @pytest.mark.parametrize(("spoilt", "share"), [("command", 0.55), ("command", 0.4), ("wheels", 0.55)])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.sources import ConfigurationError, load_configuration, merge
+from pipeline.sources import ConfigurationError, explain_unread, load_configuration, merge
 
 Write = Callable[[str, str], Path]
 
@@ -109,6 +109,44 @@ def test_another_preset_does_not_inherit_a_geometry(log: Path, write: Write) -> 
     write("2026/fleet.toml", '[vehicle]\npreset = "husky_a200"\nwheel_radius_m = 0.18\n')
     found = load_configuration(log).vehicle
     assert (found.track_width_m, found.wheel_radius_m) == (0.56, 0.18)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "is_told"),
+    [
+        ("Run.toml", "", True),
+        ("RUN.TOML", "", True),
+        ("fleet.toml", "[run]\nterrain = 'ice'\n", False),
+        ("settings.toml", "[wheels]\nsign = -1\n", True),
+        ("run.toml", "[wheels]\nsign = -1\n", False),
+        ("warthog_ice.toml", "[wheels]\nsign = -1\n", False),
+        ("other.toml", "[wheels]\nsign = -1\n", False),
+        ("pyproject.toml", "[tool.x]\ny = 1\n", False),
+        ("model.toml", "format = 1\n[vehicle]\n", False),
+        ("broken.toml", "[wheels", False),
+    ],
+)
+def test_a_file_beside_the_log_that_is_not_read_is_told(
+    name: str,
+    text: str,
+    is_told: bool,  # noqa: FBT001
+    log: Path,
+) -> None:
+    log.with_name("other.mcap").touch()
+    log.with_name(name).write_text(text, encoding="utf-8")
+    told = (
+        f"{name} beside the log is not read: name it run.toml or warthog_ice.toml, or give it with --config"
+    )
+    assert explain_unread(log) == (told if is_told else "")
+
+
+def test_a_file_in_a_recording_that_is_a_folder_has_one_name(log: Path) -> None:
+    (log.parent / "rec1").mkdir()
+    for name in ("rec1_0.mcap", "rec1_0.toml"):
+        (log.parent / "rec1" / name).write_text("[wheels]\nsign = -1\n", encoding="utf-8")
+    assert explain_unread(log.parent / "rec1").startswith(
+        "rec1_0.toml beside the log is not read: name it run.toml,"
+    )
 
 
 trees = st.recursive(

@@ -57,6 +57,13 @@ def names(sources: Sources) -> dict[str, str | None]:
     return {role: None if source is None else str(source) for role, source in roles.items()}
 
 
+@pytest.mark.parametrize(("count", "said"), [(0, "is without any message"), (None, "is not in the log")])
+def test_a_named_topic_that_cannot_be_read_says_why(count: int | None, said: str) -> None:
+    topics = ICP | ({} if count is None else {"/amcl_pose": POSE})
+    with pytest.raises(ConfigurationError, match=said):
+        choose(topics, configuration={"pose": {"topic": "/amcl_pose"}}, counts={"/amcl_pose": 0})
+
+
 CASES: dict[str, tuple[str, dict[str, str], dict[str, str | None]]] = {
     "husky with a body command": (
         "husky",
