@@ -19,6 +19,7 @@ from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_
 from pipeline.batch.executors import Limits, find_blame, open_executor
 from pipeline.batch.recordings import Recordings, Skipped, find_recordings
 from pipeline.core import SlipError, format_count
+from pipeline.datasets import note_robots
 from pipeline.report import list_noted, mark_batch, note_vehicles
 from pipeline.store import JSON, LAST_BATCH, Store
 
@@ -236,7 +237,8 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     lines += _list_waiting(todo, lines, cause)
     lines += _list_absent(store, listed, skipped, request, is_whole=not cause)
     runs = {line.run for line in lines}
-    notes += note_vehicles(one for one in store.survey().manifests if one.run in runs)
+    manifests = store.survey().manifests
+    notes += [*note_robots(manifests), *note_vehicles(one for one in manifests if one.run in runs)]
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,

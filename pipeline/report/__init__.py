@@ -43,6 +43,7 @@ from pipeline.core import (
     shorten,
     suffix_unit,
 )
+from pipeline.datasets import note_robots
 from pipeline.recording import Finding
 from pipeline.results import read_finding_table
 from pipeline.store import (
@@ -340,7 +341,7 @@ def render_catalogue(store: Store) -> str:
         columns=columns,
         rows=rows,
         batch=format_batch(store),
-        notes=note_vehicles(manifests),
+        notes=[*note_robots(manifests), *note_vehicles(manifests)],
         dated=_date_errors(gathered),
         counts=[
             f"{count} {'copy' if (state, count) == ('copy', 1) else name_state(state)}"
