@@ -162,8 +162,10 @@ def find_material(
         compared = _leave_out(compared, pl.col("run").is_in(simulated), reason)
     if not trusted_only:
         return compared
-    kept = compared.manifests.values()
-    return replace(compared, notes=(*note_robots(kept), *note_corrections(store, kept), *compared.notes))
+    selected = compared.manifests.values()
+    return replace(
+        compared, notes=(*note_robots(selected), *note_corrections(store, selected), *compared.notes)
+    )
 
 
 def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> ComparedRuns:

@@ -32,7 +32,7 @@ def note_robots(manifests: Iterable[Manifest]) -> list[str]:
     unnamed = [one for one in manifests if not _has_own_name(one)]
     notes = list[str]()
     for vehicle, own in group_by((str(one.part("vehicle").get("id")), one) for one in unnamed).items():
-        for what, named in (("topics", _tell_by_topics(own)), ("folders", _tell_by_folders(own))):
+        for what, named in (("topics", _find_namespaces(own)), ("folders", _find_folders(own))):
             robots = group_by(sorted((name, run) for run, name in named.items()))
             if len(robots) > 1:
                 notes.append(_format(vehicle, what, robots, {one.run: recorded_path(one) for one in own}))
@@ -45,28 +45,28 @@ def _has_own_name(manifest: Manifest) -> bool:
     return bool(given.get("name")) and not given.get("kind")
 
 
-def _tell_by_topics(manifests: Sequence[Manifest]) -> dict[str, str]:
+def _find_namespaces(manifests: Sequence[Manifest]) -> dict[str, str]:
     """Namespace of the robot of each run, without the slashes around it; none where several fit."""
-    held: dict[str, set[str]] = {}
+    names: dict[str, set[str]] = {}
     drives = set[str]()
     for manifest in manifests:
-        driven, placed = (
+        driven, located = (
             [name for role in roles for name in _NAME.findall(read_topic(manifest, role))]
             for roles in (("command", "wheels"), ("pose",))
         )
         # The frame of a base tells a robot as the topic of its drive does.
-        frames = [f"/{name}" for name in placed if not name.startswith("/")]
+        frames = [f"/{name}" for name in located if not name.startswith("/")]
         drives |= {*driven, *frames}
-        held[manifest.run] = {*driven, *placed, *frames}
-    robots = find_robots(drives, set().union(*held.values()))
+        names[manifest.run] = {*driven, *located, *frames}
+    robots = find_robots(drives, set().union(*names.values()))
     fitting = {
-        run: [one for one in robots if any(name.startswith(one) for name in names)]
-        for run, names in held.items()
+        run: [one for one in robots if any(name.startswith(one) for name in own)]
+        for run, own in names.items()
     }
-    return {run: own[0].strip("/") for run, own in fitting.items() if len(own) == 1}
+    return {run: spaces[0].strip("/") for run, spaces in fitting.items() if len(spaces) == 1}
 
 
-def _tell_by_folders(manifests: Sequence[Manifest]) -> dict[str, str]:
+def _find_folders(manifests: Sequence[Manifest]) -> dict[str, str]:
     """The innermost folder of each log that is named as a robot of its type."""
     folders = dict[str, str]()
     for manifest in manifests:
