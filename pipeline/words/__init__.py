@@ -76,6 +76,7 @@ else:
                 "describe_rest",
                 "describe_unexplained",
                 "format_remaining_error",
+                "format_rises",
                 "name_span",
             ),
             "findings": ("format_finding", "format_other_vehicles"),
