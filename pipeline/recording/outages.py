@@ -185,8 +185,12 @@ def find_outages(
     if not sources:
         # Nothing tells when they should turn.
         return []
-    of_side = {name: [*sources, *_roll_given(name, moved, blocks, track_m)] for name in sides}
-    read = {name: _read_side(name, side, late, blocks, known, of_side[name]) for name, side in sides.items()}
+    read = {
+        name: _read_side(
+            name, side, late, blocks, known, [*sources, *_roll_given(name, moved, blocks, track_m)]
+        )
+        for name, side in sides.items()
+    }
     goes_on = None
     if moved is not None and asked is not None:
         goes_on = _rate_going_on(moved, sources[1], known)
