@@ -6,15 +6,15 @@ from itertools import groupby
 
 from pipeline.batch.batch_plan import forget_pools, measure_results
 from pipeline.batch.batch_work import Entry, Ledger, see_nothing
-from pipeline.core import LONGEST_TEXT, SlipError, shorten
+from pipeline.core import SlipError
 from pipeline.logs import LogError, hash_log, locate_recorded
-from pipeline.report import count_logs, list_noted, read_waiting
+from pipeline.report import count_logs, list_noted
 from pipeline.store import (
-    LAST_BATCH,
     MANIFEST,
     RUNS,
     UPLOADS,
     Examination,
+    LastBatch,
     Manifest,
     Problem,
     Sample,
@@ -23,6 +23,7 @@ from pipeline.store import (
     Tally,
     encode_run,
     list_old,
+    read_last_batch,
 )
 
 _UNREADABLE = {"manifest_damaged", "name_clash"}
@@ -233,13 +234,7 @@ class Status:
         bytes: size of the results, old generations included.
         old_generations: generations that are not current.
         errors: runs that cannot be read, and folders that were not read.
-        last: when a batch last worked on a log [s since 1970]; None if none has.
-        began: when the last batch began, whether or not it worked on a log [s since 1970]; None without one.
-        ended: when it ended; None if it is still running or was killed.
-        stopped: whether a signal ended it.
-        not_started: logs that it did not start.
-        failed: why it failed before it came to the logs; empty if it did not.
-        is_idle: whether it worked on no log.
+        batch: the last batch.
     """
 
     runs: int
@@ -249,13 +244,7 @@ class Status:
     bytes: int
     old_generations: int
     errors: tuple[StoreError, ...]
-    last: float | None
-    began: float | None
-    ended: float | None
-    stopped: bool
-    not_started: int
-    failed: str
-    is_idle: bool
+    batch: LastBatch
 
 
 def read_status(store: Store) -> Status:
@@ -274,10 +263,6 @@ def read_status(store: Store) -> Status:
         for note in noted
     )
     size, unread = measure_results(store)
-    folder, name = LAST_BATCH
-    note = store.notes(folder).read(name) or {}
-    began, ended = (time if isinstance(time := note.get(key), float) else None for key in ("began", "at"))
-    last = max((entry.at for entry in entries if entry.at), default=None)
     return Status(
         runs=len(survey.manifests),
         writers=store.list_writers(),
@@ -286,11 +271,5 @@ def read_status(store: Store) -> Status:
         bytes=size,
         old_generations=sum(len(list_old(manifest)) for manifest in survey.manifests),
         errors=(*survey.errors, *unread),
-        last=last,
-        began=began,
-        ended=ended,
-        stopped=bool(note.get("stopped")),
-        not_started=read_waiting(note),
-        failed=shorten(str(note.get("failed") or ""), LONGEST_TEXT),
-        is_idle=began is not None and (last or 0.0) < began,
+        batch=read_last_batch(store),
     )

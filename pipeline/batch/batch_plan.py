@@ -349,7 +349,7 @@ _NOTE = "all runs"
 POOLED = ("datasets.parquet", "index.html")
 """Files over all runs."""
 _MOST_ROUNDS = 20
-_VERSION = 4
+_VERSION = 5
 """Version of the pooled files; increase it when their generation changes."""
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -16,18 +16,20 @@ from pipeline.analysis.analyze import describe_replaced
 from pipeline.batch import Request, Shard, Stop
 from pipeline.batch.batch_plan import make_plan, prune_results, refresh_pools
 from pipeline.batch.batch_work import STATES, Entry, Ledger, Report, Task, work_on
-from pipeline.batch.executors import Limits, find_blame, open_executor
+from pipeline.batch.executors import Executor, Limits, find_blame, open_executor
 from pipeline.batch.recordings import Recordings, Skipped, find_recordings
-from pipeline.core import SlipError, format_count
+from pipeline.core import INTERRUPTED, NOT_STARTED, UNFINISHED, SlipError
+from pipeline.datasets import note_robots
 from pipeline.report import list_noted, mark_batch, note_vehicles
 from pipeline.store import JSON, LAST_BATCH, Store
+from pipeline.words import describe_unfinished
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that would affect every other log as well."""
 
 STOPPED = "the batch was stopped"
 
-FAILED_STATES = ("failed", "quarantined", "not_started")
+FAILED_STATES = ("failed", "quarantined", *UNFINISHED)
 """States of logs that should have results and have none."""
 
 _RETRY = "It is skipped until it changes; --retry-quarantined tries it again"
@@ -94,11 +96,6 @@ class Line:
     replaced: str = ""
 
 
-def format_not_started(number: int) -> str:
-    """How many logs were not started, in words."""
-    return f"{format_count(number, 'log')} {'was' if number == 1 else 'were'} not started"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
     """Outcome of a batch.
@@ -128,19 +125,24 @@ class Outcome:
         return {state: states.count(state) for state in STATES}
 
     def list_errors(self) -> list[tuple[str, SlipError]]:
-        """The path and the error of each failure, what affects all logs first, the logs it stopped as one."""
+        """The path and the error of each failure, what affects all logs first, what is unfinished last."""
         own = sorted(
             (line for line in self.lines if line.state in {"failed", "quarantined"}),
             key=lambda line: (line.code not in STOPPING, line.unchanged, line.path),
         )
-        waiting = [line for line in self.lines if line.state == "not_started"]
         errors = [(line.path, SlipError(line.code, line.reason, hint=line.hint)) for line in own]
         errors += [("", problem) for problem in self.problems]
-        if waiting:
-            what = f"{format_not_started(len(waiting))}: {waiting[0].reason}"
-            hint = "Run the same command again" + ("" if self.stopped else " when the cause is removed")
-            errors.append(("", SlipError("not_started", what, hint=hint)))
-        return errors
+        return [*errors, *(("", error) for error in self.list_unfinished())]
+
+    def list_unfinished(self) -> list[SlipError]:
+        """An error for each of `UNFINISHED` that there are logs in: they have one cause."""
+        hint = "Run the same command again" + ("" if self.stopped else " when the cause is removed")
+        causes = {state: [line.reason for line in self.lines if line.state == state] for state in UNFINISHED}
+        return [
+            SlipError(state, f"{describe_unfinished({state: len(each)})}: {each[0]}", hint=hint)
+            for state, each in causes.items()
+            if each
+        ]
 
     @property
     def has_failed(self) -> bool:
@@ -175,20 +177,73 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     try:
         return _run(request, watch, work, started)
     except Stop as stop:
-        # The logs were not known yet.
-        return Outcome(lines=(), seconds=time.monotonic() - started, stopped=int(stop.code or 0))
+        what = "the batch was stopped before it could say what became of its logs"
+        problem = SlipError("stopped", what, hint="Run the same command again")
+        return Outcome(
+            lines=(),
+            seconds=time.monotonic() - started,
+            problems=(problem,),
+            stopped=int(stop.code or 0),
+        )
+
+
+@dataclass
+class _Progress:
+    """What a batch has done with its logs so far.
+
+    Attributes:
+        watch: is told of each log.
+        todo: the logs to work on.
+        lines: outcomes.
+        interrupted: logs that a signal interrupted; of a cluster nobody knows which these are.
+        waited: who was working on a log before, by its path.
+        earlier: of a log with new results, what the earlier ones were made with, and their folder.
+    """
+
+    watch: Watch
+    todo: Sequence[Task]
+    lines: list[Line]
+    interrupted: list[Task] = field(default_factory=list)
+    waited: dict[str, str] = field(default_factory=dict)
+    earlier: dict[str, tuple[str, Path]] = field(default_factory=dict)
+
+    def receive(self, report: Report) -> None:
+        """Take the report on a log."""
+        path = report.entry.log.path
+        if report.holder:
+            if path not in self.waited:
+                self.watch.wait(report.entry.run or path, report.holder)
+            self.waited[path] = report.holder
+            return
+        line = _make_line(report.entry, is_new=report.is_new)
+        self.lines.append(replace(line, waited_for=self.waited.get(path, "")))
+        self.earlier[path] = report.made, report.earlier
+        self.watch.notify(self.lines[-1], report.entry.log.size)
+
+    def interrupt(self, given: Mapping[Future[Report], Task]) -> None:
+        """Take the reports that are there of the logs that workers were given; the others are interrupted."""
+        for future, task in given.items():
+            if future.done() and not future.cancelled() and future.exception() is None:
+                self.receive(future.result())
+            elif future.done() or future.running():
+                self.interrupted.append(task)
+
+    def list_unfinished(self) -> list[Line]:
+        """Logs without an outcome, because of an error that affects all or a signal."""
+        known = {line.path for line in self.lines}
+        interrupted = {one.log.path for one in self.interrupted}
+        return [
+            Line(path=path, run=one.run, state=state, code=state)
+            for one in self.todo
+            if (path := one.log.path) not in known
+            for state in (INTERRUPTED if path in interrupted else NOT_STARTED,)
+        ]
 
 
 def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started: float) -> Outcome:
     began = round(time.time(), 3)
     store = Store(request.options.out)
-    listed = find_recordings(request.targets, settle_s=request.settle_s)
-    store.check_writable()
-    try:
-        planned, settled, notes = make_plan(listed, store, request)
-    except SlipError as error:
-        _note_failure(store, began, error)
-        raise
+    listed, planned, settled, notes = _find_work(store, request, began)
     ignored = {entry.log.path for entry in settled if entry.state == "ignored"}
     skipped = [each for each in listed.skipped if str(each.path) not in ignored]
     unseen: list[JSON] = [
@@ -200,43 +255,36 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     todo = _select(planned, request.shard)
     if request.targets:
         watch.plan(len(todo), len(settled), sum(task.log.size for task in todo))
-    lines = [*map(_settle, settled)]
-    waited: dict[str, str] = {}
-    earlier: dict[str, tuple[str, Path]] = {}
-
-    def receive(report: Report) -> None:
-        path = report.entry.log.path
-        if report.holder:
-            if path not in waited:
-                watch.wait(report.entry.run or path, report.holder)
-            waited[path] = report.holder
-            return
-        line = _make_line(report.entry, is_new=report.is_new)
-        lines.append(replace(line, waited_for=waited.get(path, "")))
-        earlier[path] = report.made, report.earlier
-        watch.notify(lines[-1], report.entry.log.size)
-
+    progress = _Progress(watch, todo, [*map(_settle, settled)])
     problems: tuple[SlipError, ...] = ()
     removed = stopped = 0
     try:
-        _work_through(todo, request, work, receive)
-        problems, removed = _tidy_up(store, request)
+        try:
+            _work_through(progress, request, work)
+        except Stop as stop:
+            stopped = int(stop.code or 0)
+        # Tables and pages hold what a stopped batch has done, unless it is stopped again.
+        problems, removed = _tidy_up(store, request, prunes=not stopped)
     except Stop as stop:
         stopped = int(stop.code or 0)
     finally:
+        unfinished = progress.list_unfinished()
         if request.targets:
             ended: dict[str, JSON] = {"at": round(time.time(), 3), "stopped": bool(stopped)}
-            _note_batch(store, note | ended | {"not_started": len(_list_waiting(todo, lines, ""))})
+            states = [line.state for line in unfinished]
+            _note_batch(store, note | ended | {state: states.count(state) for state in UNFINISHED})
     # Pruning may have removed them by now.
     lines = [
-        replace(line, replaced=describe_replaced(*earlier.get(line.path, ("", Path())))) for line in lines
+        replace(line, replaced=describe_replaced(*progress.earlier.get(line.path, ("", Path()))))
+        for line in progress.lines
     ]
     # Only an error that affects every log, or a signal, leaves some.
     cause = STOPPED if stopped else next((line.reason for line in lines if line.code in STOPPING), "")
-    lines += _list_waiting(todo, lines, cause)
+    lines += [replace(line, reason=cause) for line in unfinished]
     lines += _list_absent(store, listed, skipped, request, is_whole=not cause)
     runs = {line.run for line in lines}
-    notes += note_vehicles(one for one in store.survey().manifests if one.run in runs)
+    manifests = store.survey().manifests
+    notes += [*note_robots(manifests), *note_vehicles(one for one in manifests if one.run in runs)]
     return Outcome(
         lines=tuple(sorted(lines, key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -247,14 +295,21 @@ def _run(request: Request, watch: Watch, work: Callable[[Task], Report], started
     )
 
 
-def _list_waiting(todo: Sequence[Task], lines: Sequence[Line], cause: str) -> list[Line]:
-    """Logs that were not started, because of an error that affects all or a signal."""
-    known = {line.path for line in lines}
-    return [
-        Line(path=one.log.path, run=one.run, state="not_started", code="not_started", reason=cause)
-        for one in todo
-        if one.log.path not in known
-    ]
+def _find_work(
+    store: Store, request: Request, began: float
+) -> tuple[Recordings, list[Task], list[Entry], list[str]]:
+    """The recordings, and what `make_plan` makes of them; with a note where that comes to no end."""
+    try:
+        listed = find_recordings(request.targets, settle_s=request.settle_s)
+        store.check_writable()
+        try:
+            return listed, *make_plan(listed, store, request)
+        except SlipError as error:
+            _note_early_end(store, began, {"failed": str(error)})
+            raise
+    except Stop:
+        _note_early_end(store, began, {"stopped": True})
+        raise
 
 
 def _list_absent(
@@ -321,20 +376,20 @@ def _note_batch(store: Store, note: dict[str, JSON]) -> None:
         mark_batch(store)
 
 
-def _note_failure(store: Store, began: float, error: SlipError) -> None:
-    """Note that a batch failed before it came to its logs; which paths it left out stays as it was."""
+def _note_early_end(store: Store, began: float, how: dict[str, JSON]) -> None:
+    """Note that a batch ended before it came to its logs; which paths it left out stays as it was."""
     folder, name = LAST_BATCH
     unseen = (store.notes(folder).read(name) or {}).get("left_out")
-    _note_batch(
-        store,
-        {"began": began, "at": round(time.time(), 3), "failed": str(error), "left_out": cast("JSON", unseen)},
-    )
+    _note_batch(store, {"began": began, "at": round(time.time(), 3), "left_out": cast("JSON", unseen), **how})
 
 
-def _work_through(
-    todo: Sequence[Task], request: Request, work: Callable[[Task], Report], receive: Callable[[Report], None]
-) -> None:
-    """Process logs, in their order, up to an error that affects all."""
+def _work_through(progress: _Progress, request: Request, work: Callable[[Task], Report]) -> None:
+    """Process logs, in their order, up to an error that affects all.
+
+    Raises:
+        Stop: a signal.
+    """
+    todo = progress.todo
     if not todo:
         return
     limits = Limits(request.timeout_s, request.memory_bytes)
@@ -346,30 +401,41 @@ def _work_through(
     try:
         while flying or ((queue or suspects) and not is_stopped):
             while queue and len(flying) < executor.depth and not is_stopped:
-                task = queue.popleft()
-                flying[executor.submit(task)] = task
+                _submit(queue.popleft(), executor, flying, progress)
             if suspects and not flying and not is_stopped:
-                task = suspects.popleft()
-                flying[executor.submit(task)] = task
+                _submit(suspects.popleft(), executor, flying, progress)
             for future in wait(flying, return_when=FIRST_COMPLETED).done:
                 task = flying.pop(future)
-                try:
-                    report = future.result()
-                except (Exception, CancelledError) as error:  # noqa: BLE001 - whatever a worker can die of
-                    code, reason = find_blame(task, error)
-                    report = Report(entry=_judge(task, code, reason, request.find_limit(code), ledger))
-                    if report.entry.kills == 1:
-                        (suspects if executor.spreads_blame else queue).append(task)
-                        continue
+                report = _take_report(future, task, request, ledger)
+                if report.entry.kills == 1:
+                    (suspects if executor.spreads_blame else queue).append(task)
+                    continue
+                progress.receive(report)
                 if report.holder:
-                    receive(report)
                     time.sleep(_BUSY_PAUSE_S)
                     queue.append(task)
-                    continue
                 is_stopped |= report.entry.code in STOPPING
-                receive(report)
+    except Stop:
+        progress.interrupt(flying)
+        raise
     finally:
         executor.close()
+
+
+def _submit(task: Task, executor: Executor, flying: dict[Future[Report], Task], progress: _Progress) -> None:
+    """Give a log to the workers; that of this process works on it here, where a signal interrupts it."""
+    progress.interrupted.append(task)
+    flying[executor.submit(task)] = task
+    progress.interrupted.remove(task)
+
+
+def _take_report(future: Future[Report], task: Task, request: Request, ledger: Ledger) -> Report:
+    """The report on a log; one of its own where the worker was lost."""
+    try:
+        return future.result()
+    except (Exception, CancelledError) as error:  # noqa: BLE001 - whatever a worker can die of
+        code, reason = find_blame(task, error)
+        return Report(entry=_judge(task, code, reason, request.find_limit(code), ledger))
 
 
 def _judge(task: Task, code: str, reason: str, limit: float, ledger: Ledger) -> Entry:
@@ -396,13 +462,13 @@ def _judge(task: Task, code: str, reason: str, limit: float, ledger: Ledger) -> 
     return entry
 
 
-def _tidy_up(store: Store, request: Request) -> tuple[tuple[SlipError, ...], int]:
+def _tidy_up(store: Store, request: Request, *, prunes: bool) -> tuple[tuple[SlipError, ...], int]:
     """Pool the runs and remove old generations; errors are returned, so that they do not hide the outcome."""
     problems: list[SlipError] = []
     removed = 0
     try:
         refresh_pools(store)
-        if request.pruning is not None:
+        if prunes and request.pruning is not None:
             removed, unmet = prune_results(store, request.pruning)
             problems += unmet
     except SlipError as error:

@@ -13,18 +13,26 @@ import msgspec
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.core import LONGEST_TEXT, SlipError, objects_in, shorten
+from pipeline.core import LONGEST_TEXT, UNFINISHED, SlipError, objects_in, shorten
 from pipeline.logs import LogError
 from pipeline.recording import RecordingError, StageError
 from pipeline.sources import ConfigurationError
-from pipeline.store import JSON, LOG_NOTES, LOG_STATES, REPORT, LogSighting, Store, stored_contexts
+from pipeline.store import (
+    JSON,
+    LOG_NOTES,
+    LOG_STATES,
+    REPORT,
+    LogSighting,
+    Store,
+    stored_contexts,
+)
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #
 # A ledger entry counts only if the results confirm it: a log is done only while the results contain the
 # generation named in its entry. A lost entry costs one reading of the log.
 
-STATES = ("done", "unchanged", *LOG_STATES[1:], "growing", "not_started")
+STATES = ("done", "unchanged", *LOG_STATES[1:], "growing", *UNFINISHED)
 """What logs come out as in a batch; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 

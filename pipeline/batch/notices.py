@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.batch import BatchError
-from pipeline.batch.batch_run import Outcome, format_not_started
+from pipeline.batch.batch_run import Outcome
 from pipeline.core import make_plain, shorten
 from pipeline.store import Store
 
@@ -30,17 +30,14 @@ def find_news(root: Path, outcome: Outcome) -> dict[str, str]:
         for line in outcome.lines
         if line.state in _NEWS
     }
-    # Those that were not started have one cause, which stands before them.
-    waiting = [line for line in outcome.lines if line.state == "not_started"]
-    if waiting:
-        raised[f"not_started {waiting[0].reason}"] = (
-            f"{format_not_started(len(waiting))}: {waiting[0].reason}"
-        )
+    unfinished = outcome.list_unfinished()
+    # Of a state with one cause, whose number of logs differs from night to night.
+    raised |= {f"{one.code} {one.what.partition(': ')[2]}": one.what for one in unfinished}
     raised |= {f"{one.where} {one.code}": str(one) for one in outcome.problems}
     notes = Store(root).notes("batch/notified")
     sent = notes.read("sent") or {}
     # A batch that did not come to its logs knows nothing of them.
-    if outcome.lines and not waiting:
+    if outcome.lines and not unfinished:
         notes.write("sent", {about: text for about, text in raised.items() if about in sent})
     return {about: text for about, text in raised.items() if about not in sent}
 

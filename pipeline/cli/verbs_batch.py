@@ -41,7 +41,7 @@ from pipeline.cli.conventions import (
     print_note,
     summarize_error,
 )
-from pipeline.core import SlipError, measure_memory, name_state
+from pipeline.core import UNFINISHED, SlipError, measure_memory, name_state
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_run import Outcome
@@ -142,8 +142,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
         return FAILED
     for problem in outcome.problems:
         print_error(problem)
-    # Whoever stopped it waits for its end, and need not be told.
-    outcome = outcome if outcome.stopped else _report(outcome, choices.results, notify)
+    outcome = _report(outcome, choices.results, notify)
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
@@ -221,7 +220,7 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True, everything: bool
     """
     lines: list[str] = []
     for is_old in (True, False):
-        for state in (*EXPLAINED, "not_started", "copy"):
+        for state in (*EXPLAINED, *UNFINISHED, "copy"):
             own = [
                 (line.path, line.reason, line.hint)
                 for line in outcome.lines

@@ -173,17 +173,18 @@ def status(  # noqa: D417 - arguments document themselves
 
 
 def _as_json(status_now: Status) -> dict[str, object]:
+    batch = status_now.batch
     return {
         **status_now.counts,
         "runs": status_now.runs,
         "bytes": status_now.bytes,
         "old_generations": status_now.old_generations,
-        "last": status_now.last,
-        "began": status_now.began,
-        "ended": status_now.ended,
-        "stopped": status_now.stopped,
-        "not_started": status_now.not_started,
-        "failed_before_logs": status_now.failed or None,
+        "last": batch.worked,
+        "began": batch.began,
+        "ended": batch.ended,
+        "stopped": batch.stopped,
+        **batch.unfinished,
+        "failed_before_logs": batch.failed or None,
         "writing": [{"run": run, "holder": holder} for run, holder in status_now.writers.items()],
         "logs": [
             {"path": entry.log.path, **{k: v for k, v in asdict(entry).items() if k != "log"}}
@@ -193,23 +194,9 @@ def _as_json(status_now: Status) -> dict[str, object]:
     }
 
 
-def _format_time(at: float | None) -> str:
-    return "never" if at is None else f"{datetime.fromtimestamp(at).astimezone():%Y-%m-%d %H:%M}"
-
-
 def _format_status(status_now: Status, *, everything: bool) -> list[str]:
-    last = _format_time(status_now.ended)
-    if status_now.stopped:
-        last += ", stopped"
-    if status_now.not_started:
-        last += f", {format_count(status_now.not_started, 'log')} not started"
-    if status_now.began is not None and status_now.ended is None:
-        began = _format_time(status_now.began)
-        last = f"began {began} and did not end: it is still running, or it was killed"
-    elif status_now.failed:
-        last += f", failed: {status_now.failed}"
-    elif status_now.is_idle:
-        last += f" (the last that worked on a log: {_format_time(status_now.last)})"
+    from pipeline.words import describe_batch  # noqa: PLC0415 - only for this verb
+
     old = format_count(status_now.old_generations, "old generation")
     lines: list[str] = []
     for state in EXPLAINED:
@@ -218,7 +205,7 @@ def _format_status(status_now: Status, *, everything: bool) -> list[str]:
     lines += [f"damaged: {error}" for error in status_now.errors]
     lines += [
         f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
-        f"last batch    {last}",
+        f"last batch    {describe_batch(status_now.batch) or 'never'}",
         *(f"writing       {run}, by {holder}" for run, holder in status_now.writers.items()),
     ]
     return lines + format_counts(status_now.counts)

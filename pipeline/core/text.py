@@ -144,6 +144,8 @@ _NEARLY_ALL = 0.95
 """Share of the recording below which the compared duration is shown as well."""
 
 INPUTS = ("command", "measured")
+UNFINISHED = (INTERRUPTED, NOT_STARTED) = ("interrupted", "not_started")
+"""States of logs that a batch was to work on and did not finish: of those it began, and of the others."""
 _STATES = {
     "lossy": "with losses", "copy": "copies", "growing": "being written",
 }  # fmt: skip

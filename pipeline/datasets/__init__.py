@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pipeline.datasets.fleet import *
     from pipeline.datasets.pairs import *
     from pipeline.datasets.pooling import *
+    from pipeline.datasets.robots import *
     from pipeline.datasets.stored_fits import *
     from pipeline.datasets.trend import *
 else:
@@ -79,6 +80,7 @@ else:
                 "gather_runs",
                 "pool_runs",
             ),
+            "robots": ("note_robots",),
             "stored_fits": (
                 "ModelContest",
                 "ModelFit",

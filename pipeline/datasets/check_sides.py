@@ -14,6 +14,7 @@ from pipeline.datasets.check_readings import Label, RunReading, list_labels, mea
 from pipeline.datasets.compared_runs import find_run_refusal, read_digest
 from pipeline.datasets.corrections import note_corrections
 from pipeline.datasets.pooling import ComparisonError
+from pipeline.datasets.robots import note_robots
 from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.run_residuals import Input, choose_input
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
@@ -129,7 +130,13 @@ def read_sides(
         both,
         before=known[0],
         after=known[1],
-        notes=(*notes_before, *notes_after, *note_corrections(store, everything), *both.notes),
+        notes=(
+            *notes_before,
+            *notes_after,
+            *note_robots(everything),
+            *note_corrections(store, everything),
+            *both.notes,
+        ),
         others=_read_others(others, both, store),
     )
 

@@ -16,6 +16,7 @@ from pipeline.datasets.pooling import (
     label_runs,
     measure_difficulty,
 )
+from pipeline.datasets.robots import note_robots
 from pipeline.estimation.stored_diagnosis import DIAGNOSED
 from pipeline.results import FATAL
 from pipeline.run import GROUND_UNOBSERVABLE
@@ -46,7 +47,8 @@ class ComparedRuns:
         labels: one row per run: labels, ``key``, ``group``, ``mass`` [kg], ``squared_gyration`` [m^2].
         manifests: their generations by run.
         store: the results.
-        notes: runs of one vehicle that were corrected in different ways, and excluded runs with the reasons.
+        notes: runs of one vehicle that are of several robots or were corrected in different ways; excluded
+            runs with the reasons.
         refusals: reasons why slip is not observable, by run.
         date_notes: contradictory dates, and runs whose order is not known.
         total: number of runs that could count: all of the results, or those that were asked for.
@@ -99,7 +101,7 @@ def find_material(
     of another contract version, runs without a group, and runs without a pose, whose slip is that of the
     wheels against their commands; with ``trusted_only`` also runs with a finding
     that forbids conclusions. Simulated runs are left out where there are recordings. With ``trusted_only``
-    the first notes are on runs of one vehicle that were corrected in different ways.
+    the first notes are on runs of one vehicle that are of several robots or were corrected in different ways.
 
     Args:
         store: the results.
@@ -160,8 +162,10 @@ def find_material(
         compared = _leave_out(compared, pl.col("run").is_in(simulated), reason)
     if not trusted_only:
         return compared
-    notes = note_corrections(store, compared.manifests.values())
-    return replace(compared, notes=(*notes, *compared.notes))
+    selected = compared.manifests.values()
+    return replace(
+        compared, notes=(*note_robots(selected), *note_corrections(store, selected), *compared.notes)
+    )
 
 
 def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> ComparedRuns:

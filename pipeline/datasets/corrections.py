@@ -45,7 +45,7 @@ def note_corrections(store: Store, manifests: Iterable[Manifest]) -> list[str]:
     for (vehicle, section), lines in corrected.items():
         own = [one for one in manifests if vehicles[one.run] == vehicle]
         keys = {key for _, line in lines for key in _KEY.findall(line)} - _OF_ONE_RECORDING
-        for topic, alike in group_by((_read_topic(one, section), one) for one in own).items():
+        for topic, alike in group_by((read_topic(one, section), one) for one in own).items():
             if topic and not {run for run, _ in lines}.isdisjoint(one.run for one in alike):
                 notes.append(_compare_lines(f"{vehicle} ({topic})", section, keys, alike))
     mounted = group_by(
@@ -58,7 +58,7 @@ def note_corrections(store: Store, manifests: Iterable[Manifest]) -> list[str]:
     return [note for note in notes if note]
 
 
-def _read_topic(manifest: Manifest, role: str) -> str:
+def read_topic(manifest: Manifest, role: str) -> str:
     """Topics of a role in a run; empty where it has none, or they are not known."""
     try:
         summary = manifest.read_json(SUMMARY) if SUMMARY in manifest.files else {}

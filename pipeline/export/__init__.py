@@ -272,16 +272,13 @@ def require_plausible(label: str, *values: float, least: float = -LARGEST) -> No
 
 
 _FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
-_LIMITS = frozenset(
-    {
-        Quantity.SPEED_LIMIT,
-        Quantity.TURN_LIMIT,
-        Quantity.WHEEL_SPEED_LIMIT,
-        Quantity.ACCELERATION_LIMIT,
-        Quantity.TURN_ACCELERATION_LIMIT,
-        Quantity.WHEEL_ACCELERATION_LIMIT,
-    }
-)
+SPEED_LIMITS = frozenset({Quantity.SPEED_LIMIT, Quantity.TURN_LIMIT, Quantity.WHEEL_SPEED_LIMIT})
+"""Quantities that clip a constant command."""
+_TARGET_LIMITS = SPEED_LIMITS | {
+    Quantity.ACCELERATION_LIMIT,
+    Quantity.TURN_ACCELERATION_LIMIT,
+    Quantity.WHEEL_ACCELERATION_LIMIT,
+}
 """Quantities that targets have parameters for beside delays."""
 _USUAL_TOP = (1.0, 0.5)
 """Speed [m/s] and yaw rate [rad/s] if neither the fit nor the vehicle gives the largest ones."""
@@ -587,7 +584,7 @@ class Facts:
         dead = self.take(Quantity.COMMAND_DELAY)
         free = {
             effect.id: effect.change(
-                **{p.name: p.neutral for p in effect.parameters if _LIMITS.intersection(p.quantities)}
+                **{p.name: p.neutral for p in effect.parameters if _TARGET_LIMITS.intersection(p.quantities)}
             )
             for effect in self.file.model
             if effect.place is not Place.LOCALIZATION
@@ -602,7 +599,7 @@ class Facts:
 
         rise, sources, effects, is_doubtful = time(free), [*dead.sources], {*dead.effects}, dead.is_doubtful
         for effect, parameter in self._list_numbers():
-            if effect.id not in free or _LIMITS.intersection(parameter.quantities):
+            if effect.id not in free or _TARGET_LIMITS.intersection(parameter.quantities):
                 continue
             value = effect.values[parameter.name]
             change = _TRIED * max(abs(value), abs(parameter.typical))

@@ -9,16 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.core import Flags, Floats
-from pipeline.export import STEADY_S, Facts
-from pipeline.models import Effect, Place, Quantity, predict_step
+from pipeline.export import SPEED_LIMITS, STEADY_S, Facts
+from pipeline.models import Effect, Place, predict_step
 from pipeline.sources import Vehicle
 
 _SPEEDS = 4
 """Number of speeds: quarters of the largest driven one show a factor that falls or rises with speed."""
 _SAME = 0.01
 """Spread of a factor over the speeds that one value still fits: the tolerance of data sheets."""
-_LIMITS = frozenset({Quantity.SPEED_LIMIT, Quantity.TURN_LIMIT, Quantity.WHEEL_SPEED_LIMIT})
-"""Quantities of effects that clip a command."""
 
 
 def find_steady_motion(
@@ -72,7 +70,9 @@ def find_response(facts: Facts) -> Response:
     turn *= 0.5
     speeds = [float(f"{top * (n + 1) / _SPEEDS:.3g}") for n in range(_SPEEDS)]
     free = [
-        one for one in effects if not _LIMITS.intersection(q for p in one.parameters for q in p.quantities)
+        one
+        for one in effects
+        if not SPEED_LIMITS.intersection(q for p in one.parameters for q in p.quantities)
     ]
 
     def drive(acting: Sequence[Effect]) -> tuple[Floats, Floats]:

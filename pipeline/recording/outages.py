@@ -185,8 +185,12 @@ def find_outages(
     if not sources:
         # Nothing tells when they should turn.
         return []
-    of_side = {name: [*sources, *_roll_given(name, moved, blocks, track_m)] for name in sides}
-    read = {name: _read_side(side, late, blocks, known, of_side[name]) for name, side in sides.items()}
+    read = {
+        name: _read_side(
+            name, side, late, blocks, known, [*sources, *_roll_given(name, moved, blocks, track_m)]
+        )
+        for name, side in sides.items()
+    }
     goes_on = None
     if moved is not None and asked is not None:
         goes_on = _rate_going_on(moved, sources[1], known)
@@ -202,7 +206,7 @@ def find_outages(
             # With one witness alone the other side is the second one.
             others = [other for key, other in read.items() if key != name and other is not None]
             beside = others[0].usual - others[0].broad if others else np.zeros(known.size)
-        outages += _list_dead(name, side, late[1], blocks, one, of_side[name], beside, track_m)
+        outages += _list_dead(one, blocks, beside, track_m)
     return _join_sides(sorted(outages, key=lambda one: one.start))
 
 
@@ -250,6 +254,10 @@ class _Side:
     """A side's readings in blocks.
 
     Attributes:
+        name: of the side.
+        signal: its readings.
+        delay: of the motion after them [s].
+        sources: columns of what they may follow.
         values: mean speed, shape (m,).
         there: whether it is read, shape (m,).
         fits: how it follows each source.
@@ -258,6 +266,10 @@ class _Side:
         top: usual largest speed.
     """
 
+    name: str
+    signal: Held
+    delay: float
+    sources: Sequence[Floats]
     values: Floats
     there: Flags
     fits: Sequence[_Follows]
@@ -267,7 +279,12 @@ class _Side:
 
 
 def _read_side(
-    side: Held, late: tuple[float, float], blocks: _Blocks, known: Flags, sources: Sequence[Floats]
+    name: str,
+    side: Held,
+    late: tuple[float, float],
+    blocks: _Blocks,
+    known: Flags,
+    sources: Sequence[Floats],
 ) -> _Side | None:
     """How a side follows the sources; None if too little is read, or it follows none in any part."""
     there = blocks.hold_all(side.is_there(blocks.steps)) & known if side.moves else known & False
@@ -282,7 +299,8 @@ def _read_side(
     fits, gain = _follow_best(values, there, sources, broad, least)
     if gain < price_change(values.size):
         return None
-    return _Side(values, there, fits, np.max([one.rate(values) for one in fits], axis=0), broad, top)
+    usual = np.max([one.rate(values) for one in fits], axis=0)
+    return _Side(name, side, late[1], sources, values, there, fits, usual, broad, top)
 
 
 def _join_sides(outages: Sequence[Outage]) -> list[Outage]:
@@ -310,25 +328,12 @@ def _rate_going_on(moved: Floats, asked: Floats, known: Flags) -> Floats:
     return np.where(known, gain, 0.0)
 
 
-def _list_dead(
-    name: str,
-    side: Held,
-    delay: float,
-    blocks: _Blocks,
-    one: _Side,
-    sources: Sequence[Floats],
-    goes_on: Floats,
-    track_m: float | None,
-) -> list[Outage]:
+def _list_dead(one: _Side, blocks: _Blocks, goes_on: Floats, track_m: float | None) -> list[Outage]:
     """Spans in which the readings are none, and silences of a side.
 
     Args:
-        name: of the side.
-        side: its readings.
-        delay: of the motion after them [s].
-        blocks: of the motion.
         one: the readings in blocks.
-        sources: columns of what they may follow.
+        blocks: of the motion.
         goes_on: gain in likelihood where the other signals agree, shape (m,).
         track_m: distance of the sides, if it is given.
     """
@@ -338,18 +343,18 @@ def _list_dead(
     ends = np.append(blocks.steps.start[blocks.begins], np.inf)
     ends[0] = -np.inf
     for which, part in follow_likeliest(gains, price):
-        start, end = float(ends[part.start]) - delay, float(ends[part.stop]) - delay
-        span = _describe(name, side, start, end, float(gains[part, which].sum()))
+        start, end = float(ends[part.start]) - one.delay, float(ends[part.stop]) - one.delay
+        span = _describe(one.name, one.signal, start, end, float(gains[part, which].sum()))
         # A wheel may have turned at one speed before its encoder holds a value.
-        inside = (ends[:-1][part] >= span.start + delay) & (ends[:-1][part] < span.end + delay)
+        inside = (ends[:-1][part] >= span.start + one.delay) & (ends[:-1][part] < span.end + one.delay)
         rows = np.arange(part.start, part.stop)[inside]
-        columns = [each[rows] for each in sources]
+        columns = [each[rows] for each in one.sources]
         should_turn = _should_turn(one.fits[0].expected[rows], one.top) and goes_on[rows].sum() > price
         if should_turn and not _follows_otherwise(
             one.values[rows], columns, one.fits, span, 2.0 * price, track_m
         ):
             made.append(span)
-    return made + _list_silent(name, side, blocks, one.fits[0].expected, one.top)
+    return made + _list_silent(one.name, one.signal, blocks, one.fits[0].expected, one.top)
 
 
 def _follows_otherwise(

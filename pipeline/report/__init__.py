@@ -22,6 +22,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from functools import partial
+from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +44,7 @@ from pipeline.core import (
     shorten,
     suffix_unit,
 )
+from pipeline.datasets import note_robots
 from pipeline.recording import Finding
 from pipeline.results import read_finding_table
 from pipeline.store import (
@@ -55,9 +57,10 @@ from pipeline.store import (
     Store,
     date_runs,
     encode_run,
+    read_last_batch,
     recorded_path,
 )
-from pipeline.words import NOTHING, Column, format_other_vehicles
+from pipeline.words import NOTHING, Column, describe_batch, format_other_vehicles
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -339,8 +342,8 @@ def render_catalogue(store: Store) -> str:
         scripts=[read_own("report/catalogue.js")],
         columns=columns,
         rows=rows,
-        batch=format_batch(store),
-        notes=note_vehicles(manifests),
+        batch=_format_batch(store),
+        notes=[*note_robots(manifests), *note_vehicles(manifests)],
         dated=_date_errors(gathered),
         counts=[
             f"{count} {'copy' if (state, count) == ('copy', 1) else name_state(state)}"
@@ -423,38 +426,15 @@ def mark_batch(store: Store) -> None:
     Raises:
         StoreError: the disk reports an error.
     """
-    text = format_batch(store)
+    text = escape(_format_batch(store))
     store.edit_results_text(
         CATALOGUE, partial(_BATCH.sub, lambda match: f"{match[1]}{text}{match[2]}", count=1)
     )
 
 
-def format_batch(store: Store) -> str:
-    """When the last batch began and how it ended, as a sentence; empty where there was none."""
-    folder, name = LAST_BATCH
-    note = store.notes(folder).read(name) or {}
-    began, ended = (_format_moment(note.get(key)) for key in ("began", "at"))
-    if not began:
-        return ""
-    if not ended:
-        return f"The last batch began on {began} and did not end: it is still running, or it was killed."
-    how = "was stopped" if note.get("stopped") else "failed" if note.get("failed") else "ended"
-    why = shorten(" ".join(str(note.get("failed") or "").split()), LONGEST_TEXT)
-    why = why or (f"{format_count(waiting, 'log')} not started" if (waiting := read_waiting(note)) else "")
-    return f"The last batch began on {began} and {how} on {ended}{f': {why}' if why else ''}."
-
-
-def read_waiting(note: Mapping[str, object]) -> int:
-    """How many logs the last batch did not start, by its note."""
-    waiting = note.get("not_started")
-    return waiting if isinstance(waiting, int) else 0
-
-
-def _format_moment(seconds: object) -> str:
-    try:
-        return f"{datetime.fromtimestamp(float(str(seconds)), UTC):%Y-%m-%d %H:%M UTC}"
-    except (ValueError, OverflowError, OSError):
-        return ""
+def _format_batch(store: Store) -> str:
+    said = describe_batch(read_last_batch(store))
+    return f"The last batch {said}." if said else ""
 
 
 _BATCH = re.compile(r'(<p id="batch">).*?(</p>)', re.DOTALL)

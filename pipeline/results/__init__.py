@@ -29,7 +29,6 @@ else:
                 "SEARCH_CUT",
                 "as_written",
                 "find_refusal",
-                "format_rises",
                 "has_no_pose",
                 "is_small",
                 "key_finding",

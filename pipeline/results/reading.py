@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final, cast
 
 from pipeline.core import (
     JSON_DIGITS,
-    format_share,
     mapping_in,
     number_in,
     objects_in,
@@ -229,22 +228,6 @@ def list_rises(below: object, errors: object, forgiven: float = NOTHING) -> tupl
         for name in ERRORS_OVER_2S
         if as_written(errors, name) > as_written(below, name) * (1.0 + forgiven)
     )
-
-
-def format_rises(below: object, errors: object, forgiven: float = NOTHING) -> str:
-    """Which 2 s errors rise, and by how much: `position error rises by 2.0%`; empty where none does.
-
-    Args:
-        below: errors before, or the step in JSON.
-        errors: errors after.
-        forgiven: fraction by which an error may rise.
-    """
-    phrases: list[str] = []
-    for key in list_rises(below, errors, forgiven):
-        old, new = read_error(below, key), read_error(errors, key)
-        by = f" by {format_share(new / old - 1.0)}" if old else ""
-        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
-    return ", ".join(phrases)
 
 
 BUDGET_SLIP = "RMS slip over half a second"

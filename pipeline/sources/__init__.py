@@ -108,6 +108,7 @@ else:
                 "STRING_TYPE",
                 "choose_sources",
                 "find_pose_fields",
+                "find_robots",
                 "list_named",
             ),
         },

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pipeline.store.checksums import *
     from pipeline.store.files import *
     from pipeline.store.generation import *
+    from pipeline.store.last_batch import *
     from pipeline.store.manifests import *
     from pipeline.store.names import *
     from pipeline.store.parquet_tables import *
@@ -26,7 +27,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
-            "checksums": ("LAST_BATCH", "LOG_NOTES", "LOG_STATES"),
+            "checksums": ("LOG_NOTES", "LOG_STATES"),
             "files": (
                 "hold_lock",
                 "make_folder",
@@ -34,6 +35,11 @@ else:
                 "temporary_beside",
             ),
             "generation": ("Generation",),
+            "last_batch": (
+                "LAST_BATCH",
+                "LastBatch",
+                "read_last_batch",
+            ),
             "manifests": (
                 "JSON",
                 "MANIFEST",

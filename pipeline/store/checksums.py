@@ -70,10 +70,6 @@ def decode_checked(data: bytes) -> dict[str, object]:
 
 LOG_NOTES = "batch/logs"
 """Folder of the notes on logs."""
-LAST_BATCH = "batch/ended", "last"
-"""Folder and name of the note on the last batch: ``began`` and ``at`` [s since 1970], its end, which a batch
-has not that is running or was killed; whether it was ``stopped``; how many logs were ``not_started``; why it
-``failed`` before it came to the logs; and ``left_out``."""
 LOG_STATES = ("done", "lossy", "refused", "failed", "quarantined", "copy", "ignored", "left_out", "gone")
 """What became of a log of a batch; each log counts once, and each run has one log."""
 

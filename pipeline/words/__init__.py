@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
+    from pipeline.words.batches import *
     from pipeline.words.check import *
     from pipeline.words.comparison import *
     from pipeline.words.diagnosis import *
@@ -25,6 +26,7 @@ else:
     __getattr__ = open_door(
         __name__,
         {
+            "batches": ("describe_batch", "describe_unfinished"),
             "check": (
                 "check_as_json",
                 "format_junit",
@@ -74,6 +76,7 @@ else:
                 "describe_rest",
                 "describe_unexplained",
                 "format_remaining_error",
+                "format_rises",
                 "name_span",
             ),
             "findings": ("format_finding", "format_other_vehicles"),

@@ -57,10 +57,10 @@ from pipeline.words.errors import (
     describe_moments,
     describe_need,
     describe_regions,
-    describe_rises,
     describe_unexplained,
     format_fall,
     format_remaining_error,
+    format_rises,
     format_step,
 )
 from pipeline.words.findings import format_finding
@@ -234,7 +234,7 @@ def _list_raising(run: RunDiagnosis) -> list[str]:
     """The named effects that raise an error over 2 s and lower none."""
     named = {effect.id for effect in run.effects}
     return [
-        f"{name_term(name)} {describe_rises(before, after)}: it is named because the motion over "
+        f"with {name_term(name)} the {format_rises(before, after)}: it is named because the motion over "
         "shorter times is more likely with it"
         for before, after in pairwise(run.ladder)
         if list_rises(before, after, CHANCE) and not list_rises(after, before, CHANCE)
@@ -565,7 +565,7 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
             if key not in rising
             and (text := format_fall(getattr(before, key), getattr(after, key), key)) is not None
         ]
-        text = "; ".join(filter(None, [", ".join(filter(None, falling)), describe_rises(before, after)]))
+        text = "; ".join(filter(None, [", ".join(filter(None, falling)), format_rises(before, after)]))
         for name in list_added(before, after):
             falls[name] = text or (_UNCHANGED if falling else "")
     return falls

@@ -131,14 +131,14 @@ def format_excess(ratio: float) -> str:
     return f"{text} times" if float(text) >= _KNOWN_TO else "at"
 
 
-def describe_rises(before: Step, after: Step) -> str:
-    """`raises the heading error from 4.3 to 5.3 degrees`; empty where none rises by more than chance."""
-    phrases = []
+def format_rises(before: Errors, after: Errors) -> str:
+    """`position error rises by 2.0%, heading error by 5.0%`; empty where none rises by more than chance."""
+    phrases: list[str] = []
     for key in list_rises(before, after, CHANCE):
-        fall = format_fall(getattr(before, key), getattr(after, key), key)
-        by = f" from {fall.replace(' -> ', ' to ')}" if fall else ""
-        phrases.append(f"the {ERRORS_OVER_2S[key][0]} error{by}")
-    return f"raises {enumerate_texts(phrases)}" if phrases else ""
+        old, new = getattr(before, key), getattr(after, key)
+        by = f" by {format_share(new / old - 1.0)}" if old else ""
+        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
+    return ", ".join(phrases)
 
 
 def format_fall(old: float, new: float, key: str) -> str | None:

@@ -23,9 +23,9 @@ from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.estimation.transfer import Transfer, describe_beyond, describe_remaining
 from pipeline.models import Number
-from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, format_rises
+from pipeline.results import ERRORS_OVER_2S, Errors
 from pipeline.run import MotionRun
-from pipeline.words.errors import format_fall
+from pipeline.words.errors import format_fall, format_rises
 
 _HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
 _UNITS = ("m/s", "m/s", "deg/s", "over 2 s", "over 2 s")
@@ -42,7 +42,7 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         added = ", ".join(name for name in step.effects if name not in below.effects)
         removed = "" if share is None else f"{format_share(share, 0):>9}"
         lines.append(f"{'ideal' if number == 0 else f'+ {added}':<30}{_columns(step.errors)}{removed}")
-        rises = format_rises(below.errors, step.errors, CHANCE)
+        rises = format_rises(below.errors, step.errors)
         lines += [f"  ! {rises}"] if rises else []
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
@@ -61,7 +61,7 @@ def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> l
     said = [text or f"{of} unchanged" for of, text in falls.items() if text is not None]
     word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{'   '.join(said)}"
-    note = refusal or format_rises(old, new, CHANCE)
+    note = refusal or format_rises(old, new)
     return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
 

@@ -197,6 +197,32 @@ def test_logs_of_another_vehicle_than_the_stated_one_are_named(season: Path, tmp
     assert "indicates a" not in (tmp_path / "out" / "index.html").read_text()
 
 
+def test_robots_of_one_type_are_not_pooled_without_a_word(season: Path, tmp_path: Path) -> None:
+    """By the batch that brings the second robot, though it is asked for that one alone, and by the index."""
+    words = ("--settle", "0", "--executor", "inline", "--results", "out", "--json")
+    notes = []
+    for name, robot in (("a", "husky_7"), ("b", "husky_9")):
+        (season / robot).mkdir()
+        (season / f"{name}.mcap").rename(season / robot / "run.mcap")
+        notes.append(json.loads(run_verb("batch", season / robot, *words, cwd=tmp_path).stdout)["notes"])
+    assert notes[0] == []
+    (note,) = notes[1]
+    assert "husky_7 in husky_7/run; husky_9 in husky_9/run" in note
+    assert note in unescape((tmp_path / "out" / "index.html").read_text())
+    lines = re.findall(r'\[\[match\]\] glob = ("[^"]*"), vehicle.name = ("[^"]*")', note)
+    (fleet,) = re.findall(r"In (\S+fleet.toml)", note)
+    Path(fleet).write_text(
+        "".join(f"[[match]]\nglob = {glob}\nvehicle.name = {one}\n" for glob, one in lines)
+    )
+    told = json.loads(run_verb("batch", season / "husky_7", season / "husky_9", *words, cwd=tmp_path).stdout)
+    assert (told["done"], told["notes"]) == (2, [])
+    assert sorted(one.part("vehicle")["id"] for one in Store(tmp_path / "out").manifests()) == [
+        "husky_7",
+        "husky_9",
+    ]
+    assert "count as those of one robot" not in (tmp_path / "out" / "index.html").read_text()
+
+
 def test_a_fleet_file_reaches_the_logs_behind_a_link(season: Path, tmp_path: Path) -> None:
     """As they are listed: by its plain keys and by the globs of its matches."""
     logs = tmp_path / "logs"

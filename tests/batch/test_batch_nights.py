@@ -133,11 +133,11 @@ def test_a_batch_that_found_nothing_new_leaves_its_time(field: Path) -> None:
     (field / "dead.mcap").symlink_to("nothing")
     run_slip("batch", "field", *INLINE)
     second = read_status(store)
-    assert first.ended is not None
-    assert second.ended is not None
-    assert second.ended > first.ended
+    assert first.batch.ended is not None
+    assert second.batch.ended is not None
+    assert second.batch.ended > first.batch.ended
     assert second.counts["left_out"] == 1
-    assert (first.is_idle, second.is_idle) == (False, True)
+    assert (first.batch.is_idle, second.batch.is_idle) == (False, True)
     assert "(the last that worked on a log: " in run_slip("results", "status")[1]
 
 
@@ -145,11 +145,13 @@ def test_a_full_disk_is_told_first_and_those_it_stopped_as_one(field: Path) -> N
     outcome = batch(field, Path("out"), work=work_on_full_disk)
     errors = outcome.list_errors()
     assert errors[0][1].code == "disk_full"
-    assert (errors[-1][1].code, errors[-1][1].what[:24]) == ("not_started", "18 logs were not started")
+    assert (errors[-1][1].code, errors[-1][1].what[:19]) == ("not_started", "18 logs not started")
     assert counts(outcome)["not_started"] == 18
     assert ask_verb("results", "status", "--results", "out")["not_started"] == 18
     assert re.search(
-        "last batch .*, 18 logs not started", run_slip("results", "status", "--results", "out")[1]
+        "last batch .*: 18 logs not started$",
+        run_slip("results", "status", "--results", "out")[1],
+        re.MULTILINE,
     )
 
 
@@ -164,14 +166,19 @@ def test_results_of_a_log_that_is_gone_can_be_removed(field: Path) -> None:
 
 @contextmanager
 def working(field: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """A batch at its first log, which takes longer than the test."""
+    """A batch at its first text, which takes longer than the test."""
     marker = field.parent / "begun"
     marker.mkdir()
-    environment = os.environ | {"PYTHONPATH": IMPORTABLE, "BEGUN": str(marker), "PAUSE_S": "30"}
+    environment = os.environ | {
+        "PYTHONPATH": IMPORTABLE,
+        "BEGUN": str(marker),
+        "PAUSE_S": "30",
+        "SLOW": "text17",
+    }
     started = (
         "import batch_works, functools, pipeline.batch.batch_run as run, pipeline.cli as cli;"
         "run.run_batch = functools.partial(run.run_batch, work=batch_works.work_slowly);"
-        f"cli.main(['batch', 'field', *{INLINE}, *{options}])"
+        f"cli.main(['batch', 'field', *{options}])"
     )
     with subprocess.Popen(
         [sys.executable, "-c", started],
@@ -181,32 +188,68 @@ def working(field: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
         text=True,
     ) as process:
         while not any(marker.iterdir()):
+            assert process.poll() is None
             time.sleep(0.05)
         yield process
         process.kill()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_batch_that_is_stopped_says_what_was_done(field: Path, number: int, code: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "executor"), [(signal.SIGINT, 130, "inline"), (signal.SIGTERM, 143, "local")]
+)
+def test_a_batch_that_is_stopped_says_what_was_done(
+    field: Path, number: int, code: int, executor: str
+) -> None:
+    """Everywhere in the same words: what was done, at which log it was stopped, and what had not begun."""
     run_slip("batch", "field/text00.mcap", *INLINE)
-    with working(field, "--json") as process:
+    options = ("--settle", "0", "--executor", executor, "--jobs", "1", "--json", "--notify", "cat > message")
+    with working(field, *options) as process:
         process.send_signal(number)
-        told, said = process.communicate(timeout=30)
+        told, said = process.communicate(timeout=60)
     assert (said, process.returncode) == ("slip: stopped; the same command continues\n", code)
     answer = json.loads(told)
+    counted = {"done": 1, "failed": 1, "interrupted": 1, "not_started": 16}
+    assert {state: answer[state] for state in counted} == counted
+    assert [one["path"] for one in answer["logs"] if one["state"] == "interrupted"] == [
+        str(field / "text17.mcap")
+    ]
     assert answer["stopped"] is True
-    assert (answer["failed"], answer["not_started"]) == (1, 18)
-    assert answer["errors"][-1]["message"] == "18 logs were not started: the batch was stopped"
-    assert ", stopped" in run_slip("results", "status")[1]
+    texts = ["1 log interrupted: the batch was stopped", "16 logs not started: the batch was stopped"]
+    assert [one["message"] for one in answer["errors"][-2:]] == texts
+    assert json.loads(Path("message").read_text())["notified"][-2:] == texts
+    page = Path("results/index.html").read_text()
+    assert "field/a" in page
+    (said,) = re.findall(r'<p id="batch">The last batch (.*)\.</p>', page)
+    assert re.fullmatch(
+        "began on .* UTC and was stopped on .* UTC: 1 log interrupted, 16 logs not started", said
+    )
+    assert f"last batch    {said}\n" in run_slip("results", "status")[1]
+    status = ask_verb("results", "status")
+    assert {state: status[state] for state in counted} == counted | {"failed": 1}
+    assert Path("results/datasets.parquet").is_file()
     assert ask_verb("batch", "field", *INLINE, code=1)["stopped"] is False
-    assert ask_verb("results", "status")["stopped"] is False
+    status = ask_verb("results", "status")
+    assert (status["stopped"], status["interrupted"], status["not_started"]) == (False, 0, 0)
+
+
+def test_a_batch_that_is_stopped_twice_ends_at_once(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And does not wait for its tables and pages."""
+    for place in ("_work_through", "refresh_pools"):
+        monkeypatch.setattr(f"pipeline.batch.batch_run.{place}", lambda *_: os.kill(os.getpid(), 15))
+    assert field.is_dir()
+    assert ask_verb("batch", "field", *INLINE, code=143)["not_started"] == 19
+    assert ask_verb("results", "status")["not_started"] == 19
 
 
 def test_a_batch_that_is_stopped_in_its_search_says_so(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_slip("batch", "field/a.mcap", *INLINE)
     assert field.is_dir()
     monkeypatch.setattr("pipeline.batch.batch_run.find_recordings", lambda *_, **__: os.kill(os.getpid(), 15))
-    answer = ask_verb("batch", "field", *INLINE, code=143)
+    answer = ask_verb("batch", "field", *INLINE, "--notify", "cat > message", code=143)
     assert (answer["stopped"], answer["logs"]) == (True, [])
+    (news,) = json.loads(Path("message").read_text())["notified"]
+    assert news.startswith("the batch was stopped before it could say what became of its logs")
+    assert "and was stopped on" in run_slip("results", "status")[1]
 
 
 def test_a_batch_that_was_killed_did_not_end(field: Path) -> None:
@@ -215,7 +258,7 @@ def test_a_batch_that_was_killed_did_not_end(field: Path) -> None:
     assert re.search(
         r'<p id="batch">The last batch began on .* UTC and ended on .* UTC\.</p>', page.read_text()
     )
-    with working(field, "--quiet") as process:
+    with working(field, *INLINE, "--quiet") as process:
         process.kill()
     assert re.search(r'<p id="batch">The last batch began on .* UTC and did not end: ', page.read_text())
     assert "and did not end: it is still running, or it was killed" in run_slip("results", "status")[1]

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -126,16 +127,17 @@ def test_what_is_left_out_again_is_said_as_before(field: Path) -> None:
 def test_a_night_with_a_broken_fleet_file_makes_nothing_new_again(field: Path) -> None:
     """It is told itself, in the status and on the index as well."""
     words = ("batch", "field", *INLINE, "--notify", TELL)
+    (field / "<b>").mkdir()
+    (field / "broken.mcap").rename(field / "<b>" / "broken.mcap")
     assert len(ask_verb(*words, code=1)["notified"]) == 2
-    fleet = field / "fleet.toml"
+    fleet = field / "<b>" / "fleet.toml"
     fleet.write_text("ignore = [\n")
     (told,) = ask_verb(*words, code=1)["notified"]
     assert "fleet.toml" in told
     assert "fleet.toml" in ask_verb("results", "status")["failed_before_logs"]
-    assert re.search("last batch .*, failed: .*fleet.toml", run_slip("results", "status")[1])
-    assert re.search(
-        "The last batch began on .* and failed on .*fleet.toml", Path("results/index.html").read_text()
-    )
+    (said,) = re.findall("last batch    (.*)", run_slip("results", "status")[1])
+    assert re.match("began on .* UTC and failed on .* UTC: .*fleet.toml", said)
+    assert f">The last batch {escape(said)}.<" in Path("results/index.html").read_text()
     fleet.unlink()
     assert ask_verb(*words, code=3)["notified"] == []
     assert ask_verb("results", "status")["failed_before_logs"] is None

@@ -194,13 +194,13 @@ def test_an_effect_that_only_raises_errors_is_said_to_do_so() -> None:
         [(1.0, 1.0), (0.5, 0.3), (0.35, 0.199), (0.362, 0.211)],
     )
     texts = [text for _, text in list_lines(drawn)]
-    said = [text for text in texts if "raises" in text]
+    said = [text for text in texts if " rises by " in text]
     (line,) = said
     assert line == (
-        "turning lag raises the position error from 35 to 36 cm and the heading error from 11 to 12 degrees: "
+        "with turning lag the position error rises by 3.4 %, heading error by 6 %: "
         "it is named because the motion over shorter times is more likely with it"
     )
     better = replace(drawn, ladder=(*drawn.ladder[:3], replace(drawn.ladder[3], t_mrmse_m=0.3)))
-    assert not [text for _, text in list_lines(better) if "raises" in text]
+    assert not [text for _, text in list_lines(better) if " rises by " in text]
     everything = " ".join(text for _, text in list_lines(better, everything=True))
-    assert "35 -> 30 cm; raises the heading error from 11 to 12 degrees" in everything
+    assert "35 -> 30 cm; heading error rises by 6 %" in everything

@@ -12,8 +12,8 @@ from pipeline.report import begin_large, figures, format_known_share, format_num
 from pipeline.report.figures import Figure
 from pipeline.report.scene import COMPONENTS, LINE_BINS, Scene, break_lines, drop_flat_rows, thin_series
 from pipeline.report.theme import Chart, Drawing, encode_column, layer, make_axis, stack
-from pipeline.results import CHANCE, INTERVAL_SHARE, Errors, Growth, Step, format_rises
-from pipeline.words import describe_need
+from pipeline.results import INTERVAL_SHARE, Errors, Growth, Step
+from pipeline.words import describe_need, format_rises
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),
@@ -132,7 +132,7 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
             continue
         name = "ideal"
         if before is not None:
-            rises = format_rises(before, step, CHANCE)
+            rises = format_rises(before, step)
             added = [name_term(one) for one in step.effects if one not in before.effects]
             name = f"+ {', '.join(added)}{rises and f' ({rises})'}"
         angle = step.r_mrmse_rad
