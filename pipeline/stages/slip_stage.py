@@ -387,6 +387,11 @@ def _summarize_input(aggregates: pl.DataFrame, slip: pl.DataFrame, name: str) ->
     }
 
 
+def find_standing_share(slip: pl.DataFrame, name: str) -> float:
+    """Share of the samples of an input in which the vehicle stands."""
+    return float(slip.filter(pl.col("input") == name)["standing"].to_numpy().mean())
+
+
 def pick_row(aggregates: pl.DataFrame, name: str, subset: str) -> dict[str, float | None]:
     """The row of an input's subset: `all`, `transitory` or `steady`."""
     return aggregates.filter((pl.col("input") == name) & (pl.col("subset") == subset)).row(0, named=True)
