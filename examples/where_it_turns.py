@@ -12,7 +12,7 @@ import slip
 steps = slip.table("slip", results=sys.argv[1] if len(sys.argv) > 1 else "results")
 turning = (pl.col("f_w").abs() / 0.25).floor() * 0.25  # rad/s, lower edge
 table = (
-    steps.filter(~pl.col("suspect"))
+    steps.filter(~pl.col("suspect"), ~pl.col("standing"))
     .group_by("run", "input", turning_faster_than=turning)
     .agg(seconds=pl.len() / 20.0, median_modulus=pl.col("modulus").median(), bias_w=pl.col("g_w").mean())
     .sort("run", "input", "turning_faster_than")

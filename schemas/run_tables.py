@@ -220,10 +220,14 @@ class Velocities(Table):
     outlier = schemas.flag("the localization contradicts the wheels")
 
 
+COUNTED = ~pl.col("suspect") & ~pl.col("standing")
+"""Rows of tables `slip` and `windows` on which medians and fits rest."""
+
+
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
-    VERSION: ClassVar[int] = 4
+    VERSION: ClassVar[int] = 5
     FACTS: ClassVar[Mapping[str, str]] = {
         "length_scale_m": "L, which turns yaw rate into speed in the moduli",
         "wheel_radius_m": "r, radius of the wheels",
@@ -267,6 +271,9 @@ class Slip(Table):
     suspect = schemas.flag(
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
+    standing = schemas.flag(
+        "nothing is commanded and nothing moves within 2 s: no slip to measure; left out of medians and fits"
+    )
 
     @dy.rule()
     def slip_is_ideal_minus_measured(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
@@ -277,7 +284,7 @@ class Slip(Table):
 class Windows(Table):
     """One row a full window; windows start where a segment or a command step starts."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     input = schemas.source()
     t_start = schemas.seconds("start of the window")
@@ -288,6 +295,7 @@ class Windows(Table):
     suspect = schemas.flag(
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
+    standing = schemas.flag("some of its steps are those of a vehicle at rest; left out of medians and fits")
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
     rms_modulus = schemas.bounded("m/s", "root mean square of the slip modulus", 0.0)
     window_norm = schemas.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)
@@ -306,7 +314,9 @@ class Aggregates(Table):
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
     median_modulus = schemas.optional("m/s", "median slip modulus")
-    median_recorded_modulus = schemas.optional("m/s", "as recorded: nothing corrected or left out")
+    median_recorded_modulus = schemas.optional(
+        "m/s", "as recorded: nothing corrected, only standing left out"
+    )
     median_residual_modulus = schemas.optional("m/s", "median residual modulus of the model, see table slip")
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")

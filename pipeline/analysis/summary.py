@@ -30,7 +30,7 @@ from pipeline.results import (
     read_result,
     to_json,
 )
-from pipeline.stages import SUMMARY_DIGITS, pick_row, round_number, summarize_inputs
+from pipeline.stages import SUMMARY_DIGITS, find_standing_share, pick_row, round_number, summarize_inputs
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store
 
 _Packages = Mapping[str, tuple[str, ...]]
@@ -150,7 +150,8 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     setup, generation = work.setup, work.generation
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
-    by_input = summarize_inputs(aggregates, generation.read_table("slip"))
+    slip = generation.read_table("slip")
+    by_input = summarize_inputs(aggregates, slip)
     leading = "command" if "command" in by_input else "measured"
     whole = pick_row(aggregates, leading, "all")
     asked = "both" if len(work.options.inputs) > 1 else work.options.inputs[0]
@@ -175,6 +176,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         "split": _split(whole),
         "distance_m": round_number(whole["distance"]),
         "duration_s": round_number(whole["duration"]),
+        "standing_share": round_number(find_standing_share(slip, leading)),
         "height_rate_mps": round_number(whole["height_rate"]),
         "largest_kinetic_energy_j": round_number(whole["largest_kinetic_energy"]),
         "held_poses": work.contexts["extract"].get("held_poses"),

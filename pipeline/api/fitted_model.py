@@ -46,6 +46,7 @@ from pipeline.run import HORIZON_S, MotionError
 from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
 from pipeline.store import Manifest, Store
 from pipeline.words import format_ladder, format_parameters
+from schemas.run_tables import COUNTED
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")
 _DIGITS = 4
@@ -181,7 +182,7 @@ class StoredRun:
     @property
     def slip(self) -> pl.LazyFrame:
         """Slip per time step: the table ``slip`` without the rows that medians leave out."""
-        return self.table("slip").filter(~pl.col("suspect"))
+        return self.table("slip").filter(COUNTED)
 
     def list_diagnosed(self, vehicle: Vehicle) -> tuple[Effect, ...]:
         """What its stored diagnosis names, and the formula that it suggests; empty without one."""

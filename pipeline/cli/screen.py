@@ -243,6 +243,8 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     medians = _format_medians(by_input, "median_modulus")
     if "vehicle_fitted" in summary and "measured" in by_input:
         medians += f" ({format_vehicle_source('fitted')})"
+    standing = words.describe_standing(number_in(summary, "standing_share"))
+    medians += f"    {standing}" if medians and standing else ""
     if not everything:
         return [_row("slip", f"{named} {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]

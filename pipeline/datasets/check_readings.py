@@ -24,6 +24,7 @@ from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.run_residuals import Input
 from pipeline.models import Effect, Late, Model, Parameter, is_of_one_run
 from pipeline.run import MotionRun
+from schemas.run_tables import COUNTED
 
 POSITION_ERROR, HEADING_ERROR = "error.position", "error.heading"
 ERRORS = {POSITION_ERROR: "m", HEADING_ERROR: "rad"}
@@ -174,7 +175,7 @@ def measure_slip(table: pl.DataFrame, source: Input) -> Estimate:
         table: table `slip` of the run.
         source: input of the ideal model.
     """
-    rows = table.filter(pl.col("input").cast(pl.String) == source.value, ~pl.col("suspect"))
+    rows = table.filter(pl.col("input").cast(pl.String) == source.value, COUNTED)
     modulus = np.maximum(rows["modulus"].to_numpy(), _LEAST_SLIP)
     if modulus.size == 0:
         return math.nan, math.nan

@@ -38,6 +38,7 @@ from pipeline.datasets.published_chain import follow_published, read_limits
 from pipeline.results import read_finding_table
 from pipeline.store import ANALYZE_FIRST, Store, lack_runs
 from schemas import contract_of
+from schemas.run_tables import COUNTED
 
 AS_DRIVEN, EQUAL_DRIVING, AS_PUBLISHED = "median_modulus", "equal_modulus", "published_norm"
 """Quantities that are compared."""
@@ -307,7 +308,7 @@ def _read_samples(
     """Sound samples of every run on one input: slip moduli by default."""
     frame = (
         compared.scan(table)
-        .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
+        .filter(pl.col("input") == input_name, COUNTED, pl.col(value).is_finite())
         .select("run", time, value)
         .collect()
     )

@@ -11,6 +11,7 @@ from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError, group_by
 from pipeline.datasets.pairs import THIS_RUN, bound_groups, name_interval
 from pipeline.run import MOVING_MPS
 from pipeline.stages import find_fastest
+from schemas.run_tables import COUNTED
 
 
 class ComparisonError(SlipError):
@@ -215,14 +216,14 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
       root mean square ideal speed ||(f_x, f_y, L f_w)||.
 
     Args:
-        slip: table `slip` of all runs; only the columns needed are read, suspect rows are excluded.
+        slip: table `slip` of all runs; only the columns needed are read, and only the rows of medians.
         vehicles: one row per run: ``run``, ``mass`` [kg], ``squared_gyration`` (I / m) [m^2] (null if
             unknown), ``length_scale`` [m].
 
     Returns:
         ``run``, ``input`` and the measures.
     """
-    sound = slip.filter(~pl.col("suspect")).join(vehicles.lazy(), on="run")
+    sound = slip.filter(COUNTED).join(vehicles.lazy(), on="run")
     squared_yaw = (pl.col("length_scale") * pl.col("f_w")) ** 2
     ideal = (pl.col("f_x") ** 2 + pl.col("f_y") ** 2 + squared_yaw).sqrt()
     moved = pl.col("g_x") ** 2 + pl.col("g_y") ** 2

@@ -252,12 +252,9 @@ class PathResiduals(ABC):
 
     @cached_property
     def speed(self) -> float:
-        """Root mean square of the speed that the input asks for, forward and sideways [m/s]."""
-        velocities = [
-            run_residuals.predict_velocity((), _NO_DELAY) for run_residuals in self.residuals_by_run
-        ]
-        squares = np.concatenate([velocity.x**2 + velocity.y**2 for velocity in velocities])
-        return math.sqrt(float(squares.mean()))
+        """Root mean square of the speed that the input asks for in the steps, forward and sideways [m/s]."""
+        ideal = self._average([one.predict_velocity((), _NO_DELAY) for one in self.residuals_by_run])
+        return math.sqrt(float(np.mean((ideal[:, 0] ** 2 + ideal[:, 1] ** 2) / self.spans**2)))
 
     def list_horizon_errors(self, residual: Floats) -> tuple[HorizonError, ...]:
         """Errors of the predictions that these residuals add up to, over `HORIZONS_S`."""

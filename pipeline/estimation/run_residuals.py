@@ -433,7 +433,7 @@ class RunResiduals:
         return RunContext(
             vehicle=vehicle,
             times=at,
-            start_s=self.run.start_s,
+            start_s=self.run.start_s + self.run.lead_s,
             step_s=grid.step_s,
             duration_s=self.run.duration_s,
             spans=spans,
@@ -499,7 +499,8 @@ class RunResiduals:
 
 def choose_rate(runs: Iterable[MotionRun]) -> float:
     """Cell rate for modelling runs [Hz]."""
-    return _COARSE_HZ if sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS else _RATE_HZ
+    recorded_s = sum(float(run.streams[-1] - run.streams[0]) for run in runs)
+    return _COARSE_HZ if recorded_s * _RATE_HZ > _MOST_CELLS else _RATE_HZ
 
 
 def _reset_body(grid: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, rigid
+from pipeline.core import PERIODS, ROUNDING_S, Flags, Floats, Ints, SlipError, rigid
 from pipeline.logs import TopicColumns
 from pipeline.recording import pose_topics, topic_values
 from pipeline.recording.clocks import Recorded, TopicClock, align_clocks, find_pauses
@@ -34,7 +34,13 @@ from pipeline.recording.lost_messages import fill_gaps
 from pipeline.recording.pose_topics import read_bodies
 from pipeline.recording.rates import differentiate_angle, report_jumps
 from pipeline.recording.tilt import lean
-from pipeline.recording.topic_values import Span, find_spans_given, find_spans_of_state, is_inside
+from pipeline.recording.topic_values import (
+    Span,
+    find_spans_given,
+    find_spans_of_state,
+    forget_states,
+    is_inside,
+)
 from pipeline.sources import (
     DEFAULT_INTERVAL,
     UNKNOWN_VEHICLE,
@@ -286,8 +292,11 @@ class Extraction:
                 columns, clock, order = ordered
                 states = topic_values.texts(columns, "data")
                 times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
-                for section in asked:
-                    spans += find_spans_of_state(times, said, section)
+                known = forget_states(times, said, columns.log_time[order], self.data.losses)
+                held = [span for section in asked for span in find_spans_of_state(times, said, section)]
+                taken = [span for section in asked for span in find_spans_of_state(*known, section)]
+                self._report_unknown(source.topic, held, taken)
+                spans += taken
             states = [section.equals or DEFAULT_INTERVAL[1] for section in asked]
             values = " or ".join(map(repr, states))
             if not spans:
@@ -300,6 +309,13 @@ class Extraction:
             counted = {"count": len(spans), "states": states}
             self.findings.append(Finding("interval_applied", "info", source.topic, counted))
         return spans
+
+    def _report_unknown(self, topic: str, held: Sequence[Span], taken: Sequence[Span]) -> None:
+        """Tell for how long a state is not held, since it may have changed in what was lost."""
+        end = float(self._seconds(np.array([self.data.index.end_ns]))[0])
+        held_s, taken_s = (sum(min(last, end) - first for first, last in one) for one in (held, taken))
+        if held_s > taken_s + ROUNDING_S:
+            self.findings.append(Finding("state_unknown", "warning", topic, {"seconds": held_s - taken_s}))
 
     def find_tracks(self) -> Ints | None:
         """Number of each recorded pose's track, of two between which they alternate; None of one track."""

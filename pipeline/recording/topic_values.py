@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import LONGEST_NAME, Flags, Floats, Ints, rigid, shorten
-from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
+from pipeline.logs import Loss, Ragged, Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.logs.columns import complete_stamps, join_times
 from pipeline.recording.findings import Finding, StageError
 from pipeline.run import STILL_MPS
@@ -71,10 +71,39 @@ def _without(values: NDArray[np.generic], wrong: Flags) -> NDArray[np.generic]:
 Span = tuple[float, float]
 
 
-def find_spans_of_state(times: Floats, states: Sequence[str], section: IntervalSection) -> list[Span]:
+def forget_states(
+    times: Floats, states: Sequence[str], log_time: Ints, losses: Iterable[Loss]
+) -> tuple[Floats, list[str | None]]:
+    """The messages of a state topic, and None from each loss of the log until the next of them.
+
+    What was lost may have been another state.
+
+    Args:
+        times: of the messages [s], increasing, shape (n,).
+        states: their texts.
+        log_time: when they were recorded [ns], shape (n,).
+        losses: of the log.
+    """
+    edges = {edge for loss in losses for edge in (loss.start_ns, loss.end_ns) if edge is not None}
+    lost = np.array(sorted(edges), dtype=np.int64)
+    recorded = np.maximum.accumulate(log_time)
+    after = np.searchsorted(recorded, lost, side="right")
+    lost, after = lost[after > 0], after[after > 0]
+    since = times[after - 1] + (lost - recorded[after - 1]) / 1e9
+    begins = np.minimum(since, np.append(times, np.inf)[after])
+    known = np.insert(np.arange(times.size), after, -1).tolist()
+    return np.insert(times, after, begins), [None if one < 0 else states[one] for one in known]
+
+
+def find_spans_of_state(times: Floats, states: Sequence[str | None], section: IntervalSection) -> list[Span]:
     """Spans [s] in which a state topic has the section's text, within the section's own times.
 
     The last span is open: the topic need not repeat a state that persists.
+
+    Args:
+        times: from which on each state holds [s], shape (n,).
+        states: None where it is unknown.
+        section: what is asked for.
     """
     value = section.equals or DEFAULT_INTERVAL[1]
     spans: list[Span] = []

@@ -15,6 +15,7 @@ from pipeline.results import RunDiagnosis, find_refusal, read_findings
 from pipeline.run import HORIZON_S
 from pipeline.sources import VelocitySection
 from pipeline.words import format_finding
+from schemas.run_tables import COUNTED
 
 INPUTS = ("command", "measured")
 NOT_DIAGNOSED = RunDiagnosis()
@@ -289,8 +290,8 @@ class Scene:
         table = self.report.table("slip")
         if table is None:
             return {}
-        if "suspect" not in table.columns:
-            table = table.with_columns(suspect=pl.lit(value=False))
+        absent = {"suspect", "standing"}.difference(table.columns)
+        table = table.with_columns(pl.lit(value=False).alias(name) for name in sorted(absent))
         tables = {}
         for name in self.report.inputs:
             rows = table.filter(pl.col("input").cast(pl.String) == name)
@@ -300,12 +301,12 @@ class Scene:
 
     @cached_property
     def sound_slip(self) -> dict[str, pl.DataFrame]:
-        """Slip by input without suspect stretches: the basis of medians."""
-        sound = {name: frame.filter(~pl.col("suspect")) for name, frame in self.slip.items()}
+        """Slip by input without suspect stretches and those at rest: the basis of medians."""
+        sound = {name: frame.filter(COUNTED) for name, frame in self.slip.items()}
         return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
     def median_modulus(self, name: str) -> float | None:
-        """Median slip modulus on an input [m/s], without suspect stretches."""
+        """Median slip modulus on an input [m/s]; see `sound_slip`."""
         frame = self.sound_slip.get(name)
         return None if frame is None else float(np.median(frame["modulus"].to_numpy()))
 

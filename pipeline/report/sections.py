@@ -53,6 +53,7 @@ from pipeline.words import (
     describe_regions,
     describe_rest,
     describe_separation,
+    describe_standing,
     describe_unexplained,
     format_finding,
     format_remaining_error,
@@ -140,6 +141,8 @@ def _tabulate(report: RunReport) -> Table | None:
     scale = report.number("length_scale_m")
     caption = "Slip g = f(u) \u2212 v of the ideal model"
     caption += "" if scale is None else f"; slip modulus with L = {scale:g} m"
+    standing = describe_standing(report.number("standing_share"))
+    caption += f"; {standing}" if standing else ""
     if has_no_pose(read_findings(report.summary)):
         caption += "; v is that of the measured wheels: no pose is recorded"
     rows: list[list[str | Cell]] = [[words, *(c[i] for c in columns)] for i, words in enumerate(_QUANTITIES)]

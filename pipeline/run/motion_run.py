@@ -154,8 +154,8 @@ class MotionRun:
         track: the poses.
         streams: stamps of poses, commands and wheels [s], increasing; a pause is a gap of the recording.
         step_starts: start times of command steps [s].
-        excluded: times [s] of samples in bad stretches or without a live command.
-        duration_s: length of the run.
+        excluded: times [s] of samples in bad stretches, of a vehicle at rest, or without a live command.
+        duration_s: length of the run, without the time at its ends in which it stands.
         alignment: corrections of the recording.
         repeats_s: period of the published poses [s] if they are repeated until the next one is computed; zero
             if each is new.
@@ -164,6 +164,7 @@ class MotionRun:
         in_bursts: whether it stops before the next command, and how long a command acts was found by taking
             it to be as fast as commanded.
         origin: where its zero lies in the recording, see `anchored`.
+        lead_s: time that it stands before it drives.
     """
 
     name: str
@@ -183,6 +184,7 @@ class MotionRun:
     is_drive_alone: bool = False
     in_bursts: bool = False
     origin: Origin = Origin()
+    lead_s: float = 0.0
 
     @property
     def anchored(self) -> MotionRun:
@@ -297,6 +299,7 @@ def load_run(
         commands = _stop_when_silent(commands, alignment.hold_s)
     commands = _take_followed(commands, tables.get("commands"))
     steps, excluded = _read_steps(tables.get("slip"), streams)
+    begin, end = _find_driving(tables.get("slip"), streams)
     terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
     return MotionRun(
         name=name,
@@ -309,12 +312,13 @@ def load_run(
         streams=streams,
         step_starts=steps,
         excluded=excluded,
-        duration_s=float(streams[-1] - streams[0]),
+        duration_s=end - begin,
         alignment=alignment,
         repeats_s=_measure_repeats(tables["poses"]),
         is_on_course=_has_finding(tables.get("findings"), "heading_from_course"),
         is_drive_alone=_has_finding(tables.get("findings"), GROUND_UNOBSERVABLE),
         in_bursts=_has_finding(tables.get("findings"), IN_BURSTS),
+        lead_s=begin - float(streams[0]),
     )
 
 
@@ -523,13 +527,15 @@ def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
 
 def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Floats]:
     """Starts of steps and times of excluded samples, of the whole recording."""
+    from schemas.run_tables import COUNTED  # noqa: PLC0415 - only where tables are read
+
     if slip is None or slip.is_empty():
         return np.zeros(0), np.zeros(0)
     leading = "command" if (slip["input"] == "command").any() else "measured"
     rows = slip.filter(slip["input"] == leading).sort("t")
     step, times = rows["step"].to_numpy(), rows["t"].to_numpy()
     starts = times[np.concatenate(([True], np.diff(step) != 0))]
-    excluded = [slip.filter(slip["suspect"])["t"].to_numpy(), times[[0, -1]] + (-1e-3, 1e-3)]
+    excluded = [slip.filter(~COUNTED)["t"].to_numpy(), times[[0, -1]] + (-1e-3, 1e-3)]
     # Motion without a live command has no rows: such stretches are not scored either. Commands before the
     # first one are unknown.
     ends = min(float(streams[0]), times[0]) - 0.05, max(streams[-1], times[-1]) + 0.05
@@ -549,6 +555,18 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     return starts, np.unique(np.concatenate(excluded))
 
 
+def _find_driving(slip: pl.DataFrame | None, streams: Floats) -> tuple[float, float]:
+    """Stamps [s] between which a run drives: its ends, without the time in which it stands there."""
+    begin, end = float(streams[0]), float(streams[-1])
+    if slip is None or slip.is_empty() or slip["standing"].all():
+        return begin, end
+    times, driven = slip["t"].to_numpy(), slip.filter(~slip["standing"])["t"].to_numpy()
+    return (
+        float(driven.min()) if driven.min() > times.min() else begin,
+        float(driven.max()) if driven.max() < times.max() else end,
+    )
+
+
 _ALIGNED_INPUTS = tuple(f"{name}_aligned" for name in ("left", "right", "sideways", "speed"))
 TABLE_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "poses": (
@@ -563,7 +581,7 @@ TABLE_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "commands": ("t", *_ALIGNED_INPUTS, "steering", "followed"),
     "wheels": ("t", *_ALIGNED_INPUTS, "steering_aligned", "latency"),
     "imu": ("t", "rate_z"),
-    "slip": ("t", "input", "step", "suspect"),
+    "slip": ("t", "input", "step", "suspect", "standing"),
 }
 """Columns of a run's tables that models need."""
 

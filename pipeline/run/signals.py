@@ -234,9 +234,9 @@ class RunContext:
     Attributes:
         vehicle: geometry.
         times: middles of the cells [s], shape (n,).
-        start_s: start of the run [s].
+        start_s: start of the driving [s].
         step_s: width of a cell [s].
-        duration_s: length of the run [s].
+        duration_s: length of the driving, pauses included [s].
         spans: resets at the starts of spans, with the same columns.
         wheels: resets with known output of the drivetrain: columns of `Wheels.stack`.
         body: resets with known body velocity: (v_x, v_y, v_w).

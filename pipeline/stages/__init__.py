@@ -29,6 +29,7 @@ else:
                 "SUMMARY_DIGITS",
                 "find_fastest",
                 "find_residual_modulus",
+                "find_standing_share",
                 "pick_row",
                 "round_number",
                 "set_residuals",

@@ -13,8 +13,10 @@ from pipeline.sources import Configuration, Vehicle
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
 from pipeline.stages.motion_events import MotionEvents, find_events
 from pipeline.stages.spans import find_spans
+from pipeline.stages.standing import mark_standing
 from pipeline.store import JSON
 from schemas import tabulate
+from schemas.run_tables import COUNTED
 
 PUBLISHED_SAMPLES = 40
 """Samples of a published window, whose norm is not a mean: 40 at 20 Hz."""
@@ -93,7 +95,11 @@ def compute_slip(
     cut = cut_steps(velocities, known, length, configuration.slip.transitory_s)
     base = velocities.select(
         "t", "stamp", "segment", "v_x", "v_y", "v_w", "recorded_x", "recorded_y", "recorded_w"
-    ).with_columns(step=pl.Series(cut.step), transitory=pl.Series(cut.transitory))
+    ).with_columns(
+        step=pl.Series(cut.step),
+        transitory=pl.Series(cut.transitory),
+        standing=pl.Series(mark_standing(velocities, known)),
+    )
     spans = find_spans(velocities, tables["poses"], known, vehicle, hold_s)
     findings = [*_report_stale(times, ideals, hold_s), *spans.findings]
     findings += report_across(wheels if "measured" in ideals else commands)
@@ -160,7 +166,7 @@ def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
         pl.col("t").min().alias("t_start"),
         (pl.col("t").max() + 1.0 / rate).alias("t_end"),
         pl.col("segment").first(),
-        pl.col("suspect").any(),
+        pl.col("suspect", "standing").any(),
         (pl.col("transitory").mean() > 0.5).alias("transitory"),  # noqa: PLR2004 - most of the window
         pl.len().cast(pl.Int32).alias("samples"),
         (pl.col("modulus") ** 2).mean().sqrt().alias("rms_modulus"),
@@ -218,8 +224,8 @@ def aggregate_run(
 ) -> pl.DataFrame:
     """Table `aggregates` of one run.
 
-    Samples in bad stretches are left out. If command and measured wheels are both known, the mean square of
-    the slip splits into drivetrain + ground + cross, with drivetrain = f(command) - f(measured) and
+    Samples in bad stretches and at rest are left out. If command and measured wheels are both known, the mean
+    square of the slip splits into drivetrain + ground + cross, with drivetrain = f(command) - f(measured) and
     ground = f(measured) - v: vectors add, moduli do not.
 
     Args:
@@ -230,7 +236,7 @@ def aggregate_run(
         length: length scale L [m].
         moves: whether the vehicle moves; the path of one that stands is noise of the poses.
     """
-    clean, whole = slip.filter(~pl.col("suspect")), windows.filter(~pl.col("suspect"))
+    clean, whole = slip.filter(COUNTED), windows.filter(COUNTED)
     height_rate = _height_rate(velocities)
     period = float(np.median(np.diff(velocities["t"].to_numpy())))
     rows = []
@@ -239,7 +245,7 @@ def aggregate_run(
             chosen = [
                 frame.filter((pl.col("input") == name) & _in_subset(subset)) for frame in (clean, whole)
             ]
-            raw = slip.filter((pl.col("input") == name) & _in_subset(subset))
+            raw = slip.filter((pl.col("input") == name) & _in_subset(subset) & ~pl.col("standing"))
             energy = 0.5 * pl.lit(vehicle.mass_kg, dtype=pl.Float64) * find_fastest() ** 2
             split = _split_parts(clean.filter(_in_subset(subset)), length) if name == "command" else {}
             rows.append(
@@ -273,7 +279,7 @@ def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: floa
 
 def set_residuals(aggregates: pl.DataFrame, slip: pl.DataFrame) -> pl.DataFrame:
     """Table `aggregates` with the medians of the residual moduli in table `slip`."""
-    clean = slip.filter(~pl.col("suspect"))
+    clean = slip.filter(COUNTED)
     medians = [
         clean.filter((pl.col("input") == name) & _in_subset(subset))["residual_modulus"].median()
         for name, subset in aggregates.select("input", "subset").iter_rows()
@@ -363,7 +369,7 @@ def summarize_inputs(aggregates: pl.DataFrame, slip: pl.DataFrame) -> dict[str, 
 def _summarize_input(aggregates: pl.DataFrame, slip: pl.DataFrame, name: str) -> dict[str, JSON]:
     rows = {subset: pick_row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
     whole = rows["all"]
-    known = slip.filter(pl.col("input").cast(pl.String) == name, ~pl.col("suspect"))
+    known = slip.filter(pl.col("input").cast(pl.String) == name, COUNTED)
     drawn = resample_median(known["modulus"].to_numpy(), known["t"].to_numpy())
     ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
     low, high = np.quantile(drawn, ends).tolist() if drawn.size else (None, None)
@@ -379,6 +385,11 @@ def _summarize_input(aggregates: pl.DataFrame, slip: pl.DataFrame, name: str) ->
         "transitory_median_modulus": round_number(rows["transitory"]["median_modulus"]),
         "steady_median_modulus": round_number(rows["steady"]["median_modulus"]),
     }
+
+
+def find_standing_share(slip: pl.DataFrame, name: str) -> float:
+    """Share of the samples of an input in which the vehicle stands."""
+    return float(slip.filter(pl.col("input") == name)["standing"].to_numpy().mean())
 
 
 def pick_row(aggregates: pl.DataFrame, name: str, subset: str) -> dict[str, float | None]:

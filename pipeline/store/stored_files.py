@@ -167,6 +167,7 @@ class StoredSummary(msgspec.Struct):
     split: _Split | None = None
     distance_m: Number = None
     duration_s: Number = None
+    standing_share: Number = None
     choices: dict[str, _Choice | None] = {}
     vehicle_source: str | None = None
     verdict: str | None = None

@@ -52,6 +52,7 @@ else:
                 "has_dead_encoder",
                 "VERDICT",
                 "describe",
+                "describe_standing",
                 "format_lines",
                 "format_short",
                 "format_suggestion",

@@ -135,6 +135,17 @@ _LONGEST_TERM = 70
 """Characters up to which a suggested term is shown: a longer one is no formula that anybody reads."""
 
 
+_LARGE = 0.1
+"""Share of the time from which on it is said that a vehicle stands: the numbers of less hardly differ."""
+
+
+def describe_standing(share: float | None) -> str:
+    """What numbers of slip leave out where a vehicle stands for long; empty where it does not."""
+    if share is None or share < _LARGE:
+        return ""
+    return f"standing {format_share(share)} of the time, left out of these numbers"
+
+
 def describe(
     runs: Sequence[RunDiagnosis],
     following: str = "",

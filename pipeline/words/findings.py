@@ -462,6 +462,8 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "out_of_order": "{count} messages of {where} arrived out of order: sorted by their stamps",
     "duplicate_stamps": "{count} messages of {where} share their stamp with another",
     "interval_applied": _interval_applied,
+    "state_unknown": "{where} may have changed in what the log lost: for {seconds:duration}, until its next "
+    "message, its state is unknown; left out",
     "body_upside_down": "the frame of the poses of {where} leans by {lean_deg:.0f} degrees, as that of a "
     "camera, or of a sensor that is mounted upside down (ahead, right, down): it was turned upright",
     "slope_by_imu": _slope_by_imu,

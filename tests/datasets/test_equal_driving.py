@@ -38,7 +38,7 @@ def make_slip(
         pl.DataFrame(
             {
                 "run": run, "input": name, "t": t, "f_x": speed, "f_y": 0.0 * t, "f_w": turn,
-                "modulus": factor * modulus, "suspect": t < 0.0,
+                "modulus": factor * modulus, "suspect": t < 0.0, "standing": t < 0.0,
             }
         )
         for name, factor in FACTORS.items()

@@ -40,6 +40,7 @@ def _draw(name: str, gain: float, *findings: tuple[str, float | None]) -> Diagno
         "input": ["measured"] * times.size,
         "step": np.zeros(times.size, dtype=np.int32),
         "suspect": still > 1.0,
+        "standing": still > 1.0,
         "transitory": still > 1.0,
         "f_x": still + 0.5,
         "v_x": still + 0.5 * gain,

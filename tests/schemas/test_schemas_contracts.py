@@ -73,7 +73,7 @@ COMMAND = {
 SLIP = {
     **WHO, "input": "command", "t": 0.0, "stamp": 1, "segment": 0, "step": 0, "transitory": False,
     "f_x": 1.0, "f_y": 0.0, "f_w": 0.5, "v_x": 0.8, "v_y": 0.0, "v_w": 0.5,
-    "g_x": 0.2, "g_y": 0.0, "g_w": 0.0, "modulus": 0.2, "suspect": False,
+    "g_x": 0.2, "g_y": 0.0, "g_w": 0.0, "modulus": 0.2, "suspect": False, "standing": False,
 }  # fmt: skip
 FINDING = {
     **WHO, "stage": "slip", "id": "pose_gap", "severity": "info", "text": "a hole",
@@ -82,7 +82,7 @@ FINDING = {
 }  # fmt: skip
 WINDOW = {
     **WHO, "input": "command", "t_start": 0.0, "t_end": 2.0, "segment": 0, "step": 0, "transitory": True,
-    "suspect": False, "samples": 40, "rms_modulus": 0.1, "window_norm": 0.632,
+    "suspect": False, "standing": False, "samples": 40, "rms_modulus": 0.1, "window_norm": 0.632,
 }  # fmt: skip
 
 

@@ -14,7 +14,9 @@ from pipeline.logs import Loss, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.logs.writer import LogWriter
 from pipeline.recording import blame_damage
+from pipeline.recording.topic_values import find_spans_of_state, forget_states
 from pipeline.simulate import Recording
+from pipeline.sources import IntervalSection
 
 CHUNK, DATA_END = 6, 15
 ABSURD = (np.inf, -np.inf, np.nan, 1e308, -1e308, 5e-324, 1e200)
@@ -87,6 +89,32 @@ def test_a_state_that_damage_took_is_not_said_never_to_be_said(tmp_path: Path, w
         take(path, {"interval": [state]})
     assert "the log is damaged" in str(caught.value)
     assert "never says" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("losses", "spans"),
+    [
+        ([], [(1.0, np.inf)]),
+        ([(4.0, 6.0)], [(1.0, 4.0), (9.0, np.inf)]),
+        ([(4.0, None)], [(1.0, 4.0), (9.0, np.inf)]),
+        ([(4.0, 8.5)], [(1.0, 4.0), (9.0, np.inf)]),
+        ([(0.2, 0.5), (4.0, 6.0), (9.5, 12.0)], [(1.0, 4.0), (9.0, 9.5)]),
+        # What concerns other messages of the whole log is no hole.
+        ([(-1.0, 20.0), (None, None)], [(1.0, 20.0)]),
+    ],
+)
+def test_a_state_is_unknown_from_a_loss_until_its_next_message(
+    losses: list[tuple[float | None, float | None]], spans: list[tuple[float, float]]
+) -> None:
+    def stamp(time: float | None) -> int | None:
+        return None if time is None else 10**18 + round(time * 1e9)
+
+    holes = [Loss("chunk_crc", "lost", start_ns=stamp(first), end_ns=stamp(last)) for first, last in losses]
+    times = np.array([0.0, 1.0, 9.0])
+    recorded = np.array([stamp(time) for time in times.tolist()])
+    known = forget_states(times, ["idle", "calib", "calib"], recorded, holes)
+    found = find_spans_of_state(*known, IntervalSection(topic="/state", equals="calib"))
+    assert np.array(found).ravel() == pytest.approx(np.array(spans).ravel(), abs=1e-6)
 
 
 def test_further_losses_are_counted_in_words() -> None:

@@ -11,6 +11,7 @@ from store_samples import read_current
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.store import Store
+from schemas.run_tables import COUNTED
 
 LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 
@@ -97,7 +98,7 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, rec
     if "command_scale" not in known.faults:
         assert command["median_modulus"] <= 1.02 * recorded["command"]
     compared = read_current(store, run, "slip").filter(pl.col("input") == "command")
-    assert summary["duration_s"] == pytest.approx(0.05 * compared.filter(~pl.col("suspect")).height, abs=0.06)
+    assert summary["duration_s"] == pytest.approx(0.05 * compared.filter(COUNTED).height, abs=0.06)
     assert (summary["distance_m"] is None) == ("not_moving" in known.faults)
     assert summary["held_poses"] == pytest.approx(known.held, abs=0.015)
     findings = summary["findings"]

@@ -56,6 +56,7 @@ def make_slip(
             "input": pl.Series(["command"] * count, dtype=pl.Enum(["command", "measured"])),
             "transitory": np.zeros(count, dtype=bool),
             "suspect": np.zeros(count, dtype=bool),
+            "standing": np.zeros(count, dtype=bool),
             "modulus": np.full(count, modulus),
         }
     )

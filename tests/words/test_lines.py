@@ -8,7 +8,7 @@ from pipeline.core import format_length
 from pipeline.models import Number, name_term
 from pipeline.recording import Finding
 from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained
-from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
+from pipeline.words.diagnosis import describe, describe_standing, format_short, list_findings, list_lines
 from pipeline.words.effects import describe_clause
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
@@ -204,3 +204,8 @@ def test_an_effect_that_only_raises_errors_is_said_to_do_so() -> None:
     assert not [text for _, text in list_lines(better) if " rises by " in text]
     everything = " ".join(text for _, text in list_lines(better, everything=True))
     assert "35 -> 30 cm; heading error rises by 6 %" in everything
+
+
+def test_it_is_said_where_a_vehicle_stands_for_a_large_part_of_the_time() -> None:
+    assert describe_standing(0.672) == "standing 67 % of the time, left out of these numbers"
+    assert describe_standing(0.09) == describe_standing(None) == ""

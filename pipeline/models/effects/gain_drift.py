@@ -1,7 +1,8 @@
 """Gain drift: the wheels' share of their commanded speed fades over a run, as with a falling battery.
 
-T is the length of the run, t the time since its start. k is a plain number, about 10 % a run. A speed
-controller without integral part lets it through. Only encoders tell it from a fading motion of the body.
+T is the length of the run without standing at its ends, t the time since it begins to drive. k is a plain
+number, about 10 % a run. A speed controller without integral part lets it through. Only encoders tell it from
+a fading motion of the body.
 
 Source: drift of an actuator's gain, a loss of effectiveness; Zhang and Jiang, Annual Reviews in Control 2008.
 """

@@ -1,6 +1,7 @@
 """Time drift: speed and turning fade over a run, as with a falling battery or heating motors.
 
-T is the length of the run, t the time since its start. k is a plain number, about 10 % a run.
+T is the length of the run without standing at its ends, t the time since it begins to drive. k is a plain
+number, about 10 % a run.
 
 Source: first-order drift of a gain; measured on long deployments.
 """

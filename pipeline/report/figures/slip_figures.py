@@ -16,6 +16,7 @@ from pipeline.report.theme import (
     round_up,
     stack,
 )
+from schemas.run_tables import COUNTED
 
 
 def draw_trajectory(scene: Scene) -> Drawing | None:
@@ -255,7 +256,7 @@ def _format_slip(scene: Scene) -> str:
             f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
         )
     if scene.main_residual is not None:
-        median = scene.main_residual.filter(~pl.col("suspect"))["residual_modulus"].median()
+        median = scene.main_residual.filter(COUNTED)["residual_modulus"].median()
         sentences.append(f"the model leaves a median of {format_number(median)} m/s")  # type: ignore[arg-type]
     text = "Slip modulus over time: " + "; ".join(sentences) + "."
     if scene.worst_span is None:
