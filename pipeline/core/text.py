@@ -282,20 +282,25 @@ def format_part(share: float) -> str:
     return "< 0.1 %" if 0.0 < abs(share) < _LEAST_PART else format_share(share, 1)
 
 
-def format_length(metres: float) -> str:
-    """A length as text: `1.06 m`, below one metre `5.7 cm`, below one centimetre `1.8 mm`."""
+def format_length(metres: float, more: int = 0) -> str:
+    """A length as text: `1.06 m`, below one metre `5.7 cm`, below one centimetre `1.8 mm`.
+
+    Args:
+        metres: the length [m].
+        more: number of digits beyond these.
+    """
     if metres >= 1.0:
-        return f"{format_digits(metres, 3)} m"
+        return f"{format_digits(metres, 3 + more)} m"
     return (
-        f"{format_digits(100.0 * metres)} cm"
+        f"{format_digits(100.0 * metres, 2 + more)} cm"
         if metres >= _LEAST_CM
-        else f"{format_digits(1000.0 * metres)} mm"
+        else f"{format_digits(1000.0 * metres, 2 + more)} mm"
     )
 
 
-def format_angle(radians: float) -> str:
-    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`."""
-    text = format_digits(math.degrees(radians))
+def format_angle(radians: float, more: int = 0) -> str:
+    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`; or with more digits."""
+    text = format_digits(math.degrees(radians), 2 + more)
     return f"{text} degree{'s' * (text != '1')}"
 
 

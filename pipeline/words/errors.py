@@ -142,13 +142,19 @@ def describe_rises(before: Step, after: Step) -> str:
 
 
 def format_fall(old: float, new: float, key: str) -> str | None:
-    """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
+    """`1.73 -> 1.2 m`, with both units where they differ; None if unknown.
+
+    A change by more than chance has digits enough to show it; it is empty where there is none and the texts
+    agree.
+    """
     if not math.isfinite(old + new):
         return None
     render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
     texts = [render(value) for value in (old, new)]
     if texts[0] == texts[1]:
-        return ""
+        if not any(list_rises({key: one}, {key: other}, CHANCE) for one, other in ((old, new), (new, old))):
+            return ""
+        texts = [render(value, 1) for value in (old, new)]
     (number, unit), (_, other) = (text.split() for text in texts)
     same = unit.rstrip("s") == other.rstrip("s")
     return f"{number if same else texts[0]} -> {texts[1]}"

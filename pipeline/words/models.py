@@ -47,8 +47,8 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
-        verb = "does" if len(ladder.idle) == 1 else "do"
-        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
+        verb = "reduces" if len(ladder.idle) == 1 else "reduce"
+        lines.append(f"{', '.join(ladder.idle)} {verb} no held-out error by more than {format_share(CHANCE)}")
     return lines
 
 
@@ -60,7 +60,7 @@ def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> l
     }
     said = [text or f"{of} unchanged" for of, text in falls.items() if text is not None]
     word = "added" if set(after.effects) > set(before.effects) else "changed"
-    line = f"{'all effects, before -> after':<30}{'   '.join(said)}"
+    line = f"{'held out, before -> after':<30}{'   '.join(said)}"
     note = refusal or format_rises(old, new, CHANCE)
     return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
