@@ -88,6 +88,8 @@ else:
                 "tabulate_trend",
             ),
             "models": (
+                "describe_offered",
+                "describe_partial",
                 "format_change",
                 "format_contest",
                 "format_ladder",

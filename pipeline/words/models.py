@@ -3,7 +3,7 @@
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -218,6 +218,25 @@ def format_refusals(refusals: Mapping[str, str]) -> str:
     said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
     verb = "is" if len(refusals) == 1 else "are"
     return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
+
+
+def describe_offered(others: Collection[str]) -> str:
+    """With which effects the values and errors of one that is offered were fitted.
+
+    Args:
+        others: ids of the effects of the present model.
+    """
+    return "as fitted beside the effects of this model" if others else "as fitted with no other effect"
+
+
+def describe_partial(missing: Collection[str]) -> str:
+    """Why values differ from those of a diagnosis; empty where the model has all of its effects.
+
+    Args:
+        missing: ids of the effects of the diagnosis that the model lacks.
+    """
+    lacks = format_count(len(missing), "effect")
+    return f"Values as fitted in this model, which lacks {lacks} of the diagnosis." if missing else ""
 
 
 def format_change(fit: ModelFit, refusals: Mapping[str, str], *, is_made: bool = True) -> list[str]:
