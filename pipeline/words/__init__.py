@@ -73,7 +73,7 @@ else:
                 "describe_regions",
                 "describe_rest",
                 "describe_unexplained",
-                "format_remaining_error",
+                "list_remaining_errors",
                 "name_span",
             ),
             "findings": ("format_finding", "format_other_vehicles"),
