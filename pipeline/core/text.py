@@ -321,6 +321,7 @@ def format_size(count: float) -> str:
 
 def format_duration(seconds: float) -> str:
     """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
+    seconds = round_digits(seconds)
     if seconds < _MINUTE:
         return f"{round(seconds, 1) or float(f'{seconds:.1g}'):g} s"
     whole = round(seconds)
