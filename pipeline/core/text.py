@@ -282,25 +282,25 @@ def format_part(share: float) -> str:
     return "< 0.1 %" if 0.0 < abs(share) < _LEAST_PART else format_share(share, 1)
 
 
-def format_length(metres: float, more: int = 0) -> str:
+def format_length(metres: float, extra: int = 0) -> str:
     """A length as text: `1.06 m`, below one metre `5.7 cm`, below one centimetre `1.8 mm`.
 
     Args:
         metres: the length [m].
-        more: number of digits beyond these.
+        extra: number of digits beyond these.
     """
     if metres >= 1.0:
-        return f"{format_digits(metres, 3 + more)} m"
+        return f"{format_digits(metres, 3 + extra)} m"
     return (
-        f"{format_digits(100.0 * metres, 2 + more)} cm"
+        f"{format_digits(100.0 * metres, 2 + extra)} cm"
         if metres >= _LEAST_CM
-        else f"{format_digits(1000.0 * metres, 2 + more)} mm"
+        else f"{format_digits(1000.0 * metres, 2 + extra)} mm"
     )
 
 
-def format_angle(radians: float, more: int = 0) -> str:
+def format_angle(radians: float, extra: int = 0) -> str:
     """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`; or with more digits."""
-    text = format_digits(math.degrees(radians), 2 + more)
+    text = format_digits(math.degrees(radians), 2 + extra)
     return f"{text} degree{'s' * (text != '1')}"
 
 
