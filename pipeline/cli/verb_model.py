@@ -258,7 +258,8 @@ def export(  # noqa: D417 - the options document themselves
 
     Args:
         model: the model file.
-        to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json or python.
+        to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, json, python
+            or latex.
     """
     if file is not None:
         require_new(file, force=force)

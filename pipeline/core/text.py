@@ -284,20 +284,25 @@ def format_part(share: float) -> str:
     return "< 0.1 %" if 0.0 < abs(share) < _LEAST_PART else format_share(share, 1)
 
 
-def format_length(metres: float) -> str:
-    """A length as text: `1.06 m`, below one metre `5.7 cm`, below one centimetre `1.8 mm`."""
+def format_length(metres: float, extra: int = 0) -> str:
+    """A length as text: `1.06 m`, below one metre `5.7 cm`, below one centimetre `1.8 mm`.
+
+    Args:
+        metres: the length [m].
+        extra: number of digits beyond these.
+    """
     if metres >= 1.0:
-        return f"{format_digits(metres, 3)} m"
+        return f"{format_digits(metres, 3 + extra)} m"
     return (
-        f"{format_digits(100.0 * metres)} cm"
+        f"{format_digits(100.0 * metres, 2 + extra)} cm"
         if metres >= _LEAST_CM
-        else f"{format_digits(1000.0 * metres)} mm"
+        else f"{format_digits(1000.0 * metres, 2 + extra)} mm"
     )
 
 
-def format_angle(radians: float) -> str:
-    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`."""
-    text = format_digits(math.degrees(radians))
+def format_angle(radians: float, extra: int = 0) -> str:
+    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`; or with more digits."""
+    text = format_digits(math.degrees(radians), 2 + extra)
     return f"{text} degree{'s' * (text != '1')}"
 
 
@@ -318,6 +323,7 @@ def format_size(count: float) -> str:
 
 def format_duration(seconds: float) -> str:
     """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
+    seconds = round_digits(seconds)
     if seconds < _MINUTE:
         return f"{round(seconds, 1) or float(f'{seconds:.1g}'):g} s"
     whole = round(seconds)

@@ -377,8 +377,8 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
 
 
 _TITLES = {
-    POSITION_ERROR: "position error, equal speed",
-    HEADING_ERROR: "heading error, equal speed",
+    POSITION_ERROR: "remaining position error",
+    HEADING_ERROR: "remaining heading error",
     COMMANDED_TURN: "share of asked yaw rate",
     MULTIPLIER: "controller's multiplier",
 }

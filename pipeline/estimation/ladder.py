@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core import Floats, pick
+from pipeline.core import pick
 from pipeline.estimation.driving_need import list_numbers
 from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.estimation_data import EstimationData
@@ -28,8 +28,6 @@ _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
 _DRIVEN_QUANTILE = 0.99
 """Quantile of the driven speed: the maximum would be that of one bad pose."""
-_LEAST_SQUARE = 1e-24
-"""Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,11 @@ class Ladder:
 
     @property
     def idle(self) -> tuple[str, ...]:
-        """Effects that do not lower the held-out loss of the step before."""
+        """Effects whose step lowers no held-out error by more than chance."""
         return tuple(
             name
             for below, step in pairwise(self.steps)
-            if compare_losses(step.held_out, below.held_out) >= 1.0
+            if not np.any(np.array(step.errors.ratios(below.errors)) < 1.0 - CHANCE)
             for name in step.effects
             if name not in below.effects
         )
@@ -193,21 +191,6 @@ def lowers_errors(below: Errors | Mapping[str, object], errors: Errors | Mapping
         return False
     after, before = (math.prod(as_written(one, name) for name in ERRORS_OVER_2S) for one in (errors, below))
     return after < before
-
-
-def compare_losses(new: HeldOut, old: HeldOut) -> float:
-    """Ratio of two held-out losses, a geometric mean over the channels and thus independent of units."""
-    known = np.isfinite(new.residuals).all(axis=1) & np.isfinite(old.residuals).all(axis=1)
-    return math.exp(_average_logs(new.residuals[known]) - _average_logs(old.residuals[known]))
-
-
-def _average_logs(residuals: Floats) -> float:
-    return float(np.mean(np.log(_mean_squares(residuals))))
-
-
-def _mean_squares(residuals: Floats) -> Floats:
-    squares: Floats = np.maximum(np.mean(residuals**2, axis=0), _LEAST_SQUARE)
-    return squares
 
 
 @dataclass(frozen=True)

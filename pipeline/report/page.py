@@ -97,9 +97,17 @@ class ShownFigure:
 def show_figures(report: RunReport) -> dict[str, ShownFigure]:
     """Every figure for which the run has rows, by id."""
     return {
-        picture.id: ShownFigure(picture.id, {**fill_spec(picture.drawing), "title": picture.title})
+        picture.id: ShownFigure(picture.id, _head(fill_spec(picture.drawing), picture.title))
         for picture in _draw_all(report)
     }
+
+
+def _head(spec: dict[str, object], title: str) -> dict[str, object]:
+    """A specification below a title: its own one, which says what is on the vertical axis, is below that."""
+    own = spec.get("title", [])
+    lines = [own.get("text"), own.get("subtitle")] if isinstance(own, dict) else [own]
+    flat = [line for one in lines if one for line in (one if isinstance(one, list) else [one])]
+    return {**spec, "title": {"text": title, "subtitle": flat} if flat else title}
 
 
 def write_figures(

@@ -56,11 +56,11 @@ from pipeline.words import (
     describe_standing,
     describe_unexplained,
     format_finding,
-    format_remaining_error,
     format_short,
     format_suggestion,
     has_dead_encoder,
     list_largest_falls,
+    list_remaining_errors,
     list_terms,
     name_group,
     name_span,
@@ -383,13 +383,9 @@ _HEAD = (
 
 
 def format_remaining(report: RunReport) -> str:
-    """Format the error of the model relative to the noise floor; empty if unknown."""
-    diagnosis = report.diagnosis
-    if len(diagnosis.ladder) < 2 or diagnosis.noise_floor is None:  # noqa: PLR2004 - without an effect nothing remains
-        return ""
-    return format_remaining_error(
-        diagnosis.ladder[-1].t_mrmse_m, diagnosis.noise_floor.t_mrmse_m, diagnosis.explained_share
-    )
+    """The errors of the model relative to their noise floors; empty if unknown."""
+    clauses = list_remaining_errors(report.diagnosis)
+    return f"remaining error {'; '.join(clauses)}" if clauses else ""
 
 
 def view_why(report: RunReport) -> dict[str, object]:

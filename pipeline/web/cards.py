@@ -21,6 +21,7 @@ from pipeline.models import (
 from pipeline.results import Errors
 from pipeline.sources import Vehicle
 from pipeline.web import WorkbenchError
+from pipeline.words import describe_offered
 
 _STEPS = 200
 _ID = re.compile(r"[a-z][a-z0-9_]{0,39}")
@@ -37,6 +38,7 @@ def show_addition(addition: Addition, before: Errors, model: Model, asked: Asked
     effect, after = addition.effect, addition.errors
     return {
         **describe_effect(effect, model, asked),
+        "beside": describe_offered(model.ids),
         "left": addition.remaining,
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},

@@ -16,7 +16,7 @@ export const buildModel = (pane) => {
   const cards = session.effects.map((effect) => buildCard(pane, effect));
   model.replaceChildren(
     h("h2", {}, "Model"),
-    cards.length ? foldCards(pane, h("ul", { class: "cards" }, cards)) : h("p", { class: "quiet" }, "The ideal model: no effect yet."),
+    ...(cards.length ? [state.partial && h("p", { class: "quiet partial" }, state.partial), foldCards(pane, h("ul", { class: "cards" }, cards))].filter(Boolean) : [h("p", { class: "quiet" }, "The ideal model: no effect yet.")]),
     h("h2", {}, "Add an effect"),
     buildNext(pane),
     buildFormula(pane));
@@ -174,13 +174,14 @@ const buildRow = (pane, row, first) => {
   };
   const inputs = sayInputs(row);
   const about = row.named && row.formula.length ? `a formula that the diagnosis suggests for what no effect explains${inputs && `; ${inputs}`}` : row.about;
-  const marks = [row.named && h("i", { class: "mark" }, "diagnosis"),
+  const marks = [row.named && h("i", { class: "mark" }, "named by the diagnosis"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id, ...(row.named && { named: "" }) }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
       first && h("span", { class: "quiet" }, "Next"),
       h("b", {}, nameEffect(row)), h("span", { class: "quiet id" }, row.id),
       row.sentence || row.formula.length ? h("span", { class: "quiet about" }, lead(about)) : null,
+      h("span", { class: "quiet beside" }, row.beside),
       h("span", { class: "falls" }, `${change("position", "t", sayLength)}, ${change("heading", "r", sayAngle)}`),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
     h("button", { type: "button", class: "add", "aria-label": `add ${nameEffect(row)}`, data: { keep: `add ${row.id}` }, onclick: () => addRow(pane, row) }, "Add"));

@@ -23,7 +23,7 @@ from pipeline.web.jobs import Jobs
 from pipeline.web.prepared import PreparedRun, prepare_run
 from pipeline.web.runs import find_run, summarize_run
 from pipeline.web.session import Session, open_session
-from pipeline.words import describe_end, diagnosis_as_json
+from pipeline.words import describe_end, describe_partial, diagnosis_as_json
 
 _MOST_RUNS = 4
 _MOST_SESSIONS = 8
@@ -236,6 +236,7 @@ class Workbench:
 
     def _show(self, session: Session, ask: Ask) -> dict[str, object]:
         prepared, diagnosis = session.prepared, session.diagnosis
+        missing = [one.id for one in session.named if one.id not in session.step.order]
         trial = self._find_trial(session, ask.slot)
         return {
             "session": show_session(session),
@@ -244,7 +245,8 @@ class Workbench:
             "catalogue": list_catalogue(prepared.vehicle),
             "diagnosis": None if diagnosis is None else diagnosis_as_json(diagnosis),
             "named": session.list_offers(),
-            "missing": [one.id for one in session.named if one.id not in session.step.order],
+            "missing": missing,
+            "partial": describe_partial(missing),
             "trial": None if trial is None else trial.show(),
         }
 

@@ -76,8 +76,8 @@ else:
                 "describe_regions",
                 "describe_rest",
                 "describe_unexplained",
-                "format_remaining_error",
                 "format_rises",
+                "list_remaining_errors",
                 "name_span",
             ),
             "findings": ("format_finding", "format_other_vehicles"),
@@ -92,6 +92,8 @@ else:
                 "tabulate_trend",
             ),
             "models": (
+                "describe_offered",
+                "describe_partial",
                 "format_change",
                 "format_contest",
                 "format_ladder",

@@ -38,7 +38,7 @@ _HEAD = (
 )
 _VALUES = (
     "values: of the effects of one model, fitted to each run; the diagnosis of a run chooses its own "
-    "effects, with which a number may differ"
+    "effects, with which a number may differ; remaining errors: over 2 s with that model, at equal speed"
 )
 _ABOUT = "p: over all numbers of this check, against how much runs differ beyond their own errors"
 _ALONE = "intervals: of these recordings alone"

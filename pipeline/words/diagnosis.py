@@ -7,7 +7,6 @@ from itertools import pairwise
 
 from pipeline.core import (
     INPUT_WORDS,
-    format_angle,
     format_part,
     format_share,
     group_by,
@@ -26,7 +25,6 @@ from pipeline.results import (
     DETECTED_SHARE,
     ERRORS_OVER_2S,
     SEARCH_CUT,
-    Errors,
     Named,
     RunDiagnosis,
     Step,
@@ -59,9 +57,9 @@ from pipeline.words.errors import (
     describe_regions,
     describe_unexplained,
     format_fall,
-    format_remaining_error,
     format_rises,
     format_step,
+    list_remaining_errors,
 )
 from pipeline.words.findings import format_finding
 from pipeline.words.verdict import format_verdict
@@ -267,7 +265,7 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
 def _describe_correction(effect: Named, run: RunDiagnosis) -> str:
     """Which clock was corrected: that of the position may be another than that of the heading."""
     moved = any(one.id == "pose_delay" and "position_s" in one.values for one in run.findings)
-    return "of the position" if is_clock(effect) and moved else "corrected before the fit"
+    return "positions stamped d late" if is_clock(effect) and moved else "corrected before the fit"
 
 
 def format_short(effect: Named) -> str:
@@ -455,14 +453,7 @@ def _format_ambiguous(item: Undecided, falls: Mapping[str, str]) -> Iterator[str
 
 def _format_remaining(run: RunDiagnosis) -> list[str]:
     """The remaining error relative to the noise floor, and its structure."""
-    last, floor = run.ladder[-1], run.noise_floor or Errors()
-    rows = []
-    if len(run.ladder) > 1:
-        text = format_remaining_error(last.t_mrmse_m, floor.t_mrmse_m, run.explained_share)
-        rows.append(text.removeprefix("remaining error "))
-        if last.r_mrmse_rad >= ABOVE_FLOOR * floor.r_mrmse_rad > 0.0:
-            turn, least = format_angle(last.r_mrmse_rad), format_angle(floor.r_mrmse_rad)
-            rows.append(f"{turn} in heading, noise floor {least}")
+    rows = list_remaining_errors(run)
     rest = run.unexplained
     if rest is None:
         return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from pipeline.core import (
@@ -142,13 +142,19 @@ def format_rises(before: Errors, after: Errors) -> str:
 
 
 def format_fall(old: float, new: float, key: str) -> str | None:
-    """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
+    """`1.73 -> 1.2 m`, with both units where they differ; None if unknown.
+
+    A change by more than chance has digits enough to show it; it is empty where there is none and the texts
+    agree.
+    """
     if not math.isfinite(old + new):
         return None
     render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
     texts = [render(value) for value in (old, new)]
     if texts[0] == texts[1]:
-        return ""
+        if not any(list_rises({key: one}, {key: other}, CHANCE) for one, other in ((old, new), (new, old))):
+            return ""
+        texts = [render(value, 1) for value in (old, new)]
     (number, unit), (_, other) = (text.split() for text in texts)
     same = unit.rstrip("s") == other.rstrip("s")
     return f"{number if same else texts[0]} -> {texts[1]}"
@@ -173,26 +179,41 @@ def describe_end(last: Step, floor: Errors | None) -> tuple[bool, str]:
     return False, f"{size}{'' if unit == 'm' else f' in {of}'} remain, {times} the noise floor"
 
 
-def format_remaining_error(error_m: float, floor_m: float, explained: float) -> str:
-    """Sentence on the remaining error relative to the noise floor; empty where one of them is unknown.
+def list_remaining_errors(run: RunDiagnosis) -> list[str]:
+    """What remains of each error over 2 s beside its noise floor: a clause each, of position first.
+
+    Empty without an effect, and where the floor is unknown.
+    """
+    if len(run.ladder) <= 1 or run.noise_floor is None:
+        return []
+    last, floor = run.ladder[-1], run.noise_floor
+    position = _compare_to_floor(last.t_mrmse_m, floor.t_mrmse_m, format_length, run.explained_share)
+    heading = _compare_to_floor(last.r_mrmse_rad, floor.r_mrmse_rad, format_angle)
+    return [*filter(None, (position, heading.replace(",", " in heading,", 1)))]
+
+
+def _compare_to_floor(
+    error: float, least: float, render: Callable[[float], str], explained: float = math.nan
+) -> str:
+    """A remaining error relative to its noise floor; empty where one of them is unknown.
 
     Args:
-        error_m: held-out position error over 2 s with the model [m].
-        floor_m: the noise floor of that error [m].
-        explained: share of the error above the floor that the model removes; NaN where none was above.
+        error: held-out error over 2 s with the model.
+        least: the noise floor of that error.
+        render: either as text.
+        explained: share of the error above the floor that the model removes; NaN if unknown.
     """
-    if not math.isfinite(error_m + floor_m):
+    if not (math.isfinite(error) and least > 0.0):
         return ""
-    text, floor = f"remaining error {format_length(error_m)}", format_length(floor_m)
-    if error_m < floor_m if math.isnan(explained) else explained > _WHOLE:
-        return f"{text}, below the estimated noise floor of {floor}"
-    if error_m < ABOVE_FLOOR * floor_m:
-        beside = "" if floor == format_length(error_m) else f" ({floor})"
-        return f"{text}, {format_excess(error_m / floor_m)} the noise floor{beside}"
-    text, share = f"{text}, noise floor {floor}", format_share(explained, 0)
-    if not explained > 0.0 or share == format_share(0.0, 0):
+    size, floor = render(error), render(least)
+    if error < least if math.isnan(explained) else explained > _WHOLE:
+        return f"{size}, below the estimated noise floor of {floor}"
+    beside = "" if floor == size else f" ({floor})"
+    text = f"{size}, {format_excess(error / least)} the noise floor{beside}"
+    share = format_share(explained, 0)
+    if error < ABOVE_FLOOR * least or not explained > 0.0 or share == format_share(0.0, 0):
         return text
-    return f"{text}: the effects remove {share} of the error above the noise floor"
+    return f"{text}: the effects remove {share} of the error above it"
 
 
 def describe_structure(rest: Unexplained) -> str:

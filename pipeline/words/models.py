@@ -3,7 +3,7 @@
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -23,7 +23,7 @@ from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.estimation.transfer import Transfer, describe_beyond, describe_remaining
 from pipeline.models import Number
-from pipeline.results import ERRORS_OVER_2S, Errors
+from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors
 from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall, format_rises
 
@@ -47,8 +47,8 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
-        verb = "does" if len(ladder.idle) == 1 else "do"
-        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
+        verb = "reduces" if len(ladder.idle) == 1 else "reduce"
+        lines.append(f"{', '.join(ladder.idle)} {verb} no held-out error by more than {format_share(CHANCE)}")
     return lines
 
 
@@ -60,7 +60,7 @@ def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> l
     }
     said = [text or f"{of} unchanged" for of, text in falls.items() if text is not None]
     word = "added" if set(after.effects) > set(before.effects) else "changed"
-    line = f"{'all effects, before -> after':<30}{'   '.join(said)}"
+    line = f"{'held out, before -> after':<30}{'   '.join(said)}"
     note = refusal or format_rises(old, new)
     return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
@@ -218,6 +218,25 @@ def format_refusals(refusals: Mapping[str, str]) -> str:
     said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
     verb = "is" if len(refusals) == 1 else "are"
     return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
+
+
+def describe_offered(others: Collection[str]) -> str:
+    """With which effects the values and errors of one that is offered were fitted.
+
+    Args:
+        others: ids of the effects of the present model.
+    """
+    return "as fitted beside the effects of this model" if others else "as fitted with no other effect"
+
+
+def describe_partial(missing: Collection[str]) -> str:
+    """Why values differ from those of a diagnosis; empty where the model has all of its effects.
+
+    Args:
+        missing: ids of the effects of the diagnosis that the model lacks.
+    """
+    lacks = format_count(len(missing), "effect")
+    return f"Values as fitted in this model, which lacks {lacks} of the diagnosis." if missing else ""
 
 
 def format_change(fit: ModelFit, refusals: Mapping[str, str], *, is_made: bool = True) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import format_part, format_share, format_two
+from pipeline.core import format_duration, format_part, format_share, format_two
 
 PIPELINE = Path(__file__).parents[2] / "pipeline"
 
@@ -62,3 +62,7 @@ def test_no_module_writes_percent_by_itself() -> None:
         for spec in re.findall(r":[-+z0-9.]*%\}", path.read_text(encoding="utf-8"))
     ]
     assert found == []
+
+
+def test_a_duration_is_said_alike_before_and_after_it_was_stored() -> None:
+    assert {format_duration(seconds) for seconds in (451 * 0.05, 22.549999999998718, 22.55)} == {"22.6 s"}

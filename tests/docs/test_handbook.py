@@ -70,6 +70,17 @@ def test_an_effects_page_has_formula_parameters_sentence_source_and_settings() -
     ]
 
 
+def test_a_source_that_an_effect_names_by_author_and_year_has_its_title_in_the_list() -> None:
+    page = (ROOT / "docs" / "pages" / "methods.md").read_text("utf-8")
+    listed = page.partition("\n## Sources\n")[2].splitlines()
+    pages = [" ".join(effect.find_page().split()) for effect in list_effects()]
+    cited = {found for text in pages for found in re.findall(r"(\w+ et al\.) (\d{4})", text)}
+    assert {author for author, _ in cited} >= {"Becker et al.", "Samson et al."}
+    for author, year in cited:
+        entries = [line for line in listed if line.startswith(f'- {author}, "') and year in line]
+        assert len(entries) == 1, (author, year)
+
+
 @pytest.mark.long
 def test_the_search_works_from_the_disk_and_nothing_is_asked_of_a_network(
     handbook: Path, chrome: Chrome

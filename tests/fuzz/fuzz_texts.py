@@ -38,6 +38,7 @@ PARSERS = {
     "json": json.loads,
     "python": ast.parse,
     "gazebo": ET.fromstring,
+    "latex": str,
     "px4": find_target("px4").read_current,
 }
 MEMORY = 3 << 30

@@ -13,10 +13,10 @@ from target_schemas import SCHEMAS
 from verbs import run_verb
 
 from pipeline import export
-from pipeline.core import PACKAGE, read_version
+from pipeline.core import PACKAGE, read_version, split_interval
 from pipeline.export import Facts, export_model, list_targets
 from pipeline.export.spread import find_response
-from pipeline.models import find_effect, format_model, list_effects, predict_step
+from pipeline.models import find_effect, format_model, list_effects, name_term, predict_step
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
 
@@ -33,7 +33,7 @@ CASES = [
 def test_targets_are_found_by_being_there() -> None:
     texts = [path.read_text("utf-8") for path in Path(export.__path__[0]).glob("[!_]*.py")]
     names = {target.name for target in list_targets()}
-    assert names == {*SCHEMAS, "json", "python"}
+    assert names == {*SCHEMAS, "json", "python", "latex"}
     assert sum(text.count(" = Target(") for text in texts) == len(names)
     assert all(target.about and target.source for target in list_targets())
 
@@ -96,7 +96,7 @@ def test_no_export_states_a_dimension_that_is_a_stand_in(target: export.Target, 
         vehicle = json.loads(text)["vehicle"]
         assert [vehicle[name] for name in names] == [None] * len(names)
         assert vehicle["stand_ins"].keys() == set(names)
-    elif target.name != "python":
+    elif target.name not in {"python", "latex"}:
         # Nothing else is missing: in limits of the body the stand-in cancels out.
         usual = read(target.name, export_model(make_full(known), target.name))
         found = read(target.name, text)
@@ -247,6 +247,32 @@ def test_every_text_says_which_version_and_recording_its_values_come_from(name: 
     assert f"Written by {PACKAGE} {read_version()}." in text
     assert "Fitted from wheel encoders of 'yard/monday' (SHA-256 8be38fc23b7a)." in text
     assert "drive_lag.tau = 0.3 s (this run, 95 %: 0.2 to 0.4; another run: " in text
+
+
+def test_a_table_for_latex_has_the_values_of_the_screen_and_a_mark_at_each_doubt() -> None:
+    ends = {"effective_track.k": (1.79, 1.8206), "turn_acceleration_limit.limit": (1.9, 2.1)}
+    file = make(
+        find_effect("effective_track")(k=1.8053),
+        find_effect("turn_acceleration_limit")(limit=2.0),
+        find_effect("wheel_asymmetry")(e=-0.05),
+        intervals=ends,
+        doubts={"turn_acceleration_limit.limit": ("too_short", 0), "wheel_asymmetry.e": ("too_short", 0)},
+    )
+    text = export_model(file, "latex")
+    body = [line for line in text.splitlines() if not line.startswith("%")]
+    rows = [line.removesuffix(r" \\").split(" & ") for line in body if " & " in line]
+    assert [row[0] for row in rows] == ["Effect", *(name_term(effect.id) for effect in file.model)]
+    value, *ends_shown = split_interval(1.8053, *ends["effective_track.k"])
+    known, limit, asymmetry = (
+        next(row for row in rows if row[0] == name_term(name))
+        for name in ("effective_track", "turn_acceleration_limit", "wheel_asymmetry")
+    )
+    assert known[2:] == [f"${value}$", f"${ends_shown[0]}$ to ${ends_shown[1]}$", ""]
+    assert limit[2:] == [r"$2.00$\textsuperscript{a}", "$1.90$ to $2.10$", r"rad/s\textsuperscript{2}"]
+    assert asymmetry[2:] == [r"$-0.05$\textsuperscript{a}", "--", ""]
+    (note,) = [line for line in body if line.startswith(r"\multicolumn")]
+    assert file.list_doubtful()["wheel_asymmetry.e"].reason in note
+    assert (body[0], body[-1]) == (r"\begin{tabular}{llrll}", r"\end{tabular}")
 
 
 def test_a_clock_of_poses_is_no_parameter_of_a_controller_and_is_said_not_to_be() -> None:

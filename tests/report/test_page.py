@@ -16,7 +16,7 @@ from pipeline.report import (
     render_template,
     show_text,
 )
-from pipeline.report.page import render_report
+from pipeline.report.page import render_report, show_figures
 from pipeline.report.pages import Page
 from pipeline.report.scene import RunReport
 
@@ -238,3 +238,15 @@ def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:
 )
 def test_a_number_that_is_rounded_up_has_no_digit_too_many(value: float, text: str) -> None:
     assert format_number(value) == text
+
+
+def test_a_figure_of_its_own_says_what_is_on_each_axis() -> None:
+    shown = {name: figure.to_dict() for name, figure in show_figures(make_report()).items()}
+    heads = {
+        "signature-effective_track": "yaw rate error [rad/s]",
+        "enough": "relative half-width of the 95 % interval",
+        "modulus": "[m/s]",
+    }
+    for name, head in heads.items():
+        assert head in " ".join(shown[name]["title"]["subtitle"]), name
+    assert shown["ladder"]["title"] == "The error after each effect"

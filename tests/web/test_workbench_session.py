@@ -338,13 +338,18 @@ def test_terminal_offer_and_workbench_give_a_model_one_number(diagnosed: Workben
     floor = told["noise_floor"]
     assert shown["session"]["floor"] == {"t": floor["t_mrmse_m"], "r": floor["r_mrmse_rad"]}
     for count, name in enumerate(names, 1):
+        # Where the model has fewer effects than the diagnosis, offers and cards say of which fit values are.
+        lacks = f"{len(names) - count + 1} effect"
+        assert lacks in shown["partial"]
+        others = "beside the effects of this model" if count > 1 else "with no other effect"
+        assert {row["beside"] for row in shown["named"]} == {f"as fitted {others}"}
         (offer,) = [row["to"] for row in shown["named"] if row["id"] == name]
         shown = cast("Json", diagnosed.session(WIDE, "add", effect=name))
         now = shown["session"]["errors"]
         assert (now["t"], now["r"]) == pytest.approx((offer["t"], offer["r"]), rel=5e-6, abs=5e-7)
         if (known := said.get(frozenset(names[:count]))) is not None:
             assert (now["t"], now["r"]) == pytest.approx(known, rel=2e-6, abs=1e-6)
-    assert (shown["named"], shown["missing"]) == ([], [])
+    assert (shown["named"], shown["missing"], shown["partial"]) == ([], [], "")
 
 
 def test_all_of_the_diagnosis_is_its_model_whatever_was_done_before(diagnosed: Workbench) -> None:

@@ -1,16 +1,20 @@
 """Lines of a diagnosis: few by default, each idea once."""
 
+from types import SimpleNamespace
+
 import pytest
 from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 
 from pipeline.core import format_length
+from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.models import Number, name_term
 from pipeline.recording import Finding
-from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained
+from pipeline.results import DataNeed, Errors, Named, Region, RunDiagnosis, Unexplained
 from pipeline.words.diagnosis import describe, describe_standing, format_short, list_findings, list_lines
 from pipeline.words.effects import describe_clause
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
+from pipeline.words.models import describe_step, format_ladder
 
 MANY = (
     "effective_track",
@@ -186,6 +190,27 @@ def test_a_share_is_rounded_once(k: float, half: float, share: str) -> None:
     drawn = draw_diagnosis({"effective_track": {"k": k}}, [(1.0, 1.0), (0.5, 0.3)])
     known = replace(drawn.effects[0], parameters={"k": Number(k, k - half, k + half)})
     assert describe_clause(known, drawn) == f"turns at {share} of the ideal rate"
+
+
+def test_a_ladder_and_the_sentences_below_it_tell_of_the_same_errors() -> None:
+    rows = {
+        "ideal": (0.1, 0.5),
+        "effective_track": (0.0240, 0.0350),
+        "wheel_asymmetry": (0.0246, 0.0333),  # one falls by 5 %, one rises by more than chance
+        "difference_gain": (0.0246, 0.0333),
+        "side_gain": (0.0252, 0.0333),
+    }
+    steps, names = [], list(rows)
+    for number, (position, heading) in enumerate(rows.values()):
+        held_out = SimpleNamespace(pooled=Errors((0.1, 0.1, 0.1), t_mrmse_m=position, r_mrmse_rad=heading))
+        fitted = SimpleNamespace(model=SimpleNamespace(ids=tuple(names[1 : number + 1])))
+        steps.append(LadderStep(fitted, held_out))  # type: ignore[arg-type]
+    lines = format_ladder(Ladder(tuple(steps)))
+    assert lines[-1] == "difference_gain, side_gain reduce no held-out error by more than 1 %"
+    assert "  ! position error rises by 2.5 %" in lines
+    changed, note = describe_step(steps[-2], steps[-1])
+    assert changed.split(maxsplit=5)[-1] == "2.46 -> 2.52 cm   heading unchanged"
+    assert note.startswith("  ! position error rises by 2.4 %")
 
 
 def test_an_effect_that_only_raises_errors_is_said_to_do_so() -> None:

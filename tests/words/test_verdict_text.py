@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from drawn_diagnoses import FLOOR, check_form, check_verdict, draw_diagnosis
+from drawn_diagnoses import check_form, check_verdict, draw_diagnosis
 from msgspec.structs import replace
 
 from pipeline.analysis import Options
@@ -14,11 +14,11 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Number, find_effect, list_effects
 from pipeline.results import Errors, Named, Refused, RunDiagnosis, Unexplained, read_result
-from pipeline.results.reading import ABOVE_FLOOR, split_main
+from pipeline.results.reading import split_main
 from pipeline.sources import list_presets
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.words.effects import describe_clause
-from pipeline.words.errors import format_remaining_error
+from pipeline.words.errors import list_remaining_errors
 from pipeline.words.models import suggest_export
 from pipeline.words.verdict import format_verdict
 
@@ -140,15 +140,23 @@ def test_the_verdict_on_a_recording_is_that_of_its_stored_results(log: Path | No
 def test_the_verdict_and_the_line_below_agree_on_the_noise_floor(error: float, says: str) -> None:
     diagnosis = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.2), (error, 0.02 * error / 0.05)])
     assert says in format_verdict(diagnosis)
-    line = format_remaining_error(error, FLOOR["t_mrmse_m"], 0.98)
-    assert ("at the noise floor" in line) is (says == "at the noise floor")
-    assert (says in line) or error >= ABOVE_FLOOR * FLOOR["t_mrmse_m"]
+    lines = list_remaining_errors(diagnosis)
+    assert [says in line for line in lines] == [True, True]
+    for line, floor in zip(lines, ("5 cm", "1.1 degrees"), strict=True):
+        assert f"{says} ({floor})" in line
 
 
 @pytest.mark.parametrize("explained", [math.nan, -0.2, 0.0, 0.004])
 def test_effects_that_remove_nothing_are_not_said_to_remove_a_share(explained: float) -> None:
-    assert format_remaining_error(0.4, 0.2, explained) == "remaining error 40 cm, noise floor 20 cm"
-    assert "remove 50 % of the error" in format_remaining_error(0.4, 0.2, 0.5)
+    diagnosis = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.2), (0.4, 0.01)])
+    shares = [replace(diagnosis, explained_share=one) for one in (explained, 0.5)]
+    assert [list_remaining_errors(one) for one in shares] == [
+        [
+            f"40 cm, 8 times the noise floor (5 cm){removed}",
+            "0.57 degrees in heading, below the estimated noise floor of 1.1 degrees",
+        ]
+        for removed in ("", ": the effects remove 50 % of the error above it")
+    ]
 
 
 def test_understeer_is_told_at_a_speed_that_the_car_reaches() -> None:
