@@ -530,6 +530,17 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     commanded_turn: CommandedTurn | None = None
     asked: Asked | None = None
 
+    def list_own(self) -> dict[str, dict[str, Number]]:
+        """Numbers that runs judged together have of their own: by label ``effect.name``, then by run."""
+        return {
+            f"{effect.id}.{name}": {
+                run: numbers[name] for run, numbers in zip(self.joint, effect.by_run, strict=True)
+            }
+            for effect in self.effects
+            for name in effect.parameters
+            if name in effect.own
+        }
+
     @property
     def has_suggestion(self) -> bool:
         """Whether a formula is suggested that would lower the error, and that no model holds yet."""

@@ -50,6 +50,7 @@ from pipeline.words.effects import (
     is_clock,
     is_open,
     name_group,
+    name_scope,
     suggest_drive,
 )
 from pipeline.words.errors import (
@@ -264,10 +265,8 @@ def format_short(effect: Named) -> str:
 
     The name of an effect of one number with a unit says what it is: `yaw rate limit: limit = 1.01 rad/s`.
     """
-    if is_clock(effect) and effect.by_run:
-        return "one offset a run"
     if effect.own:
-        return _format_by_ground(effect)
+        return _format_own(effect)
     if not effect.shown:
         return ""
     known = list(effect.shown.items())
@@ -291,8 +290,8 @@ def format_short(effect: Named) -> str:
     return "; ".join([*shown, *([f"{hidden} more"] if hidden else [])])
 
 
-def _format_by_ground(effect: Named) -> str:
-    """The range over the terrains of the first value that differs between them and is known."""
+def _format_own(effect: Named) -> str:
+    """The range over runs or terrains of the first value that differs between them and is known."""
     for name in filter(effect.own.__contains__, effect.parameters):
         known = [one[name] for one in effect.by_run if not one[name].is_undetermined]
         if known:
@@ -300,9 +299,9 @@ def _format_by_ground(effect: Named) -> str:
             ends = dict.fromkeys(f"{round_digits(one.value, one.digits):.3g}" for one in (low, high))
             about = describe_number(effect.id, name)
             elsewhere = " where it is known" if len(known) < len(effect.by_run) else ""
-            text = f"{name} = {' to '.join(ends)}{suffix_unit(low.unit)} by terrain{elsewhere}"
+            text = f"{name} = {' to '.join(ends)}{suffix_unit(low.unit)} {name_scope(effect)}{elsewhere}"
             return f"{text}, {about}" if about else text
-    return "open on every terrain"
+    return "open in every run" if is_clock(effect) else "open on every terrain"
 
 
 def _format_largest_fall(before: Step, after: Step) -> str:
@@ -546,7 +545,7 @@ def _list_shared(effect: Named) -> dict[str, Number]:
 
 
 def _format_values(effect: Named, shared: Mapping[str, Number]) -> str:
-    return "a clock offset of each run:" if is_clock(effect) and effect.by_run else _format_all(shared)
+    return f"{name_scope(effect)}:" if effect.own and not shared else _format_all(shared)
 
 
 def _format_all(numbers: Mapping[str, Number]) -> str:
