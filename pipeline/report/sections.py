@@ -42,6 +42,7 @@ from pipeline.results import (
     key_finding,
     read_finding_table,
     read_findings,
+    read_model,
     split_main,
 )
 from pipeline.words import (
@@ -225,8 +226,8 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
         steps.append(("Add the suggested term, and see the error fall", f"slip serve {name}"))
     if diagnosis.effects:
         steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
-        kind = "" if diagnosis.vehicle is None else diagnosis.vehicle.kind
-        steps.append(("Export it to the controller", suggest_export(kind, "model.toml")))
+        if (file := read_model(diagnosis)) is not None:
+            steps.append(("Export it", suggest_export(file, "model.toml")))
         against = f"slip model compare model.toml --against literature --on {name}"
         steps.append(("Compare it with models of the literature", against))
     if diagnosis.undecided or diagnosis.unobservable_why:

@@ -1,11 +1,16 @@
 """Lines of a diagnosis: few by default, each idea once."""
 
+import math
+
+import numpy as np
 import pytest
 from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 
 from pipeline.core import format_length
-from pipeline.models import Number, name_term
+from pipeline.estimation.diagnosis import _parameter_rows
+from pipeline.estimation.driving_need import Curve, measure_need
+from pipeline.models import FEW_STRETCHES, Number, name_term
 from pipeline.recording import Finding
 from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained
 from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
@@ -135,10 +140,33 @@ def test_a_region_of_two_errors_is_said_once() -> None:
             "4 of 16 parameters are known within 5 %; 7 more minutes of such driving for 5 % of all",
         ),
         (DataNeed(open=1), "the one parameter is not known within 5 %"),
+        (DataNeed(("a.k",), math.nan, 60.0), "a.k is known within 5 %"),
     ],
 )
 def test_how_much_is_known_is_one_sentence(need: DataNeed, said: str) -> None:
     assert describe_need(RunDiagnosis(need=need)) == said
+
+
+def test_what_is_in_doubt_is_not_known_and_why_is_said() -> None:
+    drawn = draw_diagnosis({"steering_lag": {"tau": 0.45}, "deadband": {"d": 0.2}}, [(1.0, 0.5)] * 3)
+    lag, deadband = drawn.effects
+    sure, open_ends = Number(0.45, 0.449, 0.451, "s"), Number(0.2, 0.195, 0.205, "m/s")
+    few = replace(sure, doubt=FEW_STRETCHES, stretches=4)
+    curve = {"steering_lag.tau": Curve(np.array([20.0, 60.0]), np.array([0.002, 0.001]))}
+    for tau, d, said in (
+        (few, open_ends, f"1 of 2 parameters is known within 5 %; steering_lag.tau: {few.reason}"),
+        (sure, open_ends, "2 of 2 parameters are known within 5 %"),
+        (sure, replace(open_ends, low=0.1, high=0.3), "1 of 2 parameters is known within 5 %"),
+    ):
+        effects = (replace(lag, parameters={"tau": tau}), replace(deadband, parameters={"d": d}))
+        need = measure_need(effects, curve)
+        assert describe_need(replace(drawn, effects=effects, need=need)) == said
+        rows = {row["parameter"]: row["doubt"] for row in _parameter_rows(replace(drawn, effects=effects))}
+        assert rows == {"tau": tau.doubt, "d": ""}
+    alone = replace(drawn, effects=(replace(lag, parameters={"tau": sure}),))
+    assert describe_need(replace(alone, need=measure_need(alone.effects, curve))) == (
+        "steering_lag.tau is known within 5 %, after 20 s of 60 s"
+    )
 
 
 def test_motion_that_lasts_is_one_short_sentence() -> None:

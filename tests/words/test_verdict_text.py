@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, Number, find_effect, list_effects
+from pipeline.export import export_model, list_omitted
+from pipeline.models import FEW_STRETCHES, Model, ModelFile, Number, find_effect, list_effects
 from pipeline.results import Errors, Named, Refused, RunDiagnosis, Unexplained, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main
 from pipeline.sources import list_presets
@@ -99,8 +99,23 @@ def test_what_differs_between_grounds_is_a_range_in_the_verdict() -> None:
 
 def test_the_export_that_is_suggested_takes_the_vehicle() -> None:
     for vehicle in _PRESETS.values():
-        *_, target = suggest_export(vehicle.kind, "robot.toml").split()
-        assert export_model(ModelFile(Model(vehicle, ())), target)
+        file = ModelFile(Model(vehicle, ()))
+        *_, target = suggest_export(file, "robot.toml").split()
+        assert export_model(file, target)
+
+
+def test_the_export_that_is_suggested_leaves_not_all_out() -> None:
+    effects = (find_effect("drive_lag")().change(tau=0.3), find_effect("effective_track")().change(k=1.6))
+    known = Number(1.6, 1.55, 1.65)
+    doubtful = replace(known, doubt=FEW_STRETCHES, stretches=3)
+    lag = replace(doubtful, value=0.3, low=0.29, high=0.31, unit="s")
+    for count, number, expected in ((1, lag, "python"), (2, known, "ros2_control"), (2, doubtful, "python")):
+        numbers = {"drive_lag.tau": lag, "effective_track.k": number}
+        fit = {"runs": [{"run": "field/a"}]}
+        file = ModelFile(Model(_PRESETS["husky_a200"], effects[:count]), numbers=numbers, fit=fit)
+        *_, target = suggest_export(file, "robot.toml").split()
+        assert target == expected
+        assert len(list_omitted(file, target)) < count
 
 
 def test_a_verdict_is_never_too_long() -> None:
