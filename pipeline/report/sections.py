@@ -46,6 +46,7 @@ from pipeline.results import (
     split_main,
 )
 from pipeline.words import (
+    BELOW_MAIN,
     Cell,
     Column,
     Table,
@@ -393,7 +394,7 @@ def format_remaining(report: RunReport) -> str:
 def view_why(report: RunReport) -> dict[str, object]:
     """Effects, open questions, and the split in one sentence."""
     diagnosis = report.diagnosis
-    main, minor = split_main(diagnosis.effects, diagnosis.ladder)
+    main, minor = split_main(diagnosis.effects, diagnosis)
     rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
     split = report.part("split")
     drivetrain, ground, cross = (number_in(split, name) for name in ("drivetrain", "ground", "cross"))
@@ -402,8 +403,9 @@ def view_why(report: RunReport) -> dict[str, object]:
         "diagnosed": report.is_diagnosed,
         "named": [_view_effect(report, entry) for entry in main],
         "smaller": [_view_effect(report, entry) for entry in minor],
+        "below": BELOW_MAIN,
         # A group that counts as one smaller effect.
-        "groups": sum(is_small(group.in_model, diagnosis.ladder) for group in diagnosis.undecided),
+        "groups": sum(is_small(group.in_model, diagnosis) for group in diagnosis.undecided),
         "undecided": bool(diagnosis.undecided),
         "remaining": format_remaining(report),
         "table": Table("Effects", _HEAD, rows),

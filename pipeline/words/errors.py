@@ -16,7 +16,7 @@ from pipeline.core import (
     format_share,
     group_by,
 )
-from pipeline.models import FEW_STRETCHES
+from pipeline.models import FEW_STRETCHES, TOO_SHORT
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
@@ -273,7 +273,7 @@ def describe_need(run: RunDiagnosis) -> str:
         (number.reason, f"{effect.id}.{name}")
         for effect in run.effects
         for name, number in effect.parameters.items()
-        if number.doubt == FEW_STRETCHES
+        if number.doubt in {FEW_STRETCHES, TOO_SHORT}
     )
     sentences += [f"{', '.join(labels)}: {reason}" for reason, labels in few.items()]
     others = "the others" if known else "it" if count == 1 else "them"

@@ -12,7 +12,8 @@ from pipeline.estimation.diagnosis import _parameter_rows
 from pipeline.estimation.driving_need import Curve, measure_need
 from pipeline.models import FEW_STRETCHES, Number, name_term
 from pipeline.recording import Finding
-from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained
+from pipeline.results import DataNeed, Named, Region, RunDiagnosis, Unexplained, rank_main
+from pipeline.results.reading import rank_effects
 from pipeline.words.diagnosis import describe, format_short, list_findings, list_lines
 from pipeline.words.effects import describe_clause
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
@@ -37,11 +38,32 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
     assert [text.startswith(name_term(name)) for name, text in zip(MANY, shown[:5], strict=False)] == [
         True
     ] * 5
-    assert shown[5] == "2 smaller effects (--all)"
+    assert shown[5] == "2 more effects (--all)"
     assert shown[6:] == ["!  warning 0", "!  warning 1", "!  warning 2", "   2 more (--all)"]
     everything = describe([run], everything=True)
     assert all(name in everything for name in (*MANY, "warning 4"))
     assert "(--all)" not in everything
+
+
+def test_no_effect_is_hidden_that_removes_more_than_one_that_is_shown() -> None:
+    names = ("effective_track", "wheel_radius", "lateral_skid", "body_turn_limit", "deadband")
+    errors = [(1.0, 1.0), (0.5, 0.5), (0.46, 0.46), (0.2, 0.46), (0.2, 0.38), (0.19, 0.38)]
+    values = {"wheel_radius": {"k": 0.8}}
+    shares = {"effective_track": 0.4, "body_turn_limit": 0.3, "lateral_skid": 0.2, "deadband": 0.02}
+    budget = [
+        {"input": "command", "quantity": "slip", "total": 1.0,
+         "shares": [{"effect": name, "share": share} for name, share in shares.items()]},
+    ]  # fmt: skip
+    drawn = draw_diagnosis({name: values.get(name, {}) for name in names}, errors, budget=budget)
+    run = replace(drawn, run="field/run", input="command")
+    shown = [text for label, text in list_lines(run) if label != "verdict"]
+    assert [text.split("  ")[0] for text in shown[:4]] == [name_term(name) for name in names[:4]]
+    assert "listed for its large value" in shown[1]
+    assert shown[4] == "1 smaller effect (each below a tenth of every error; --all)"
+    assert {*rank_main(run)} == {name for name, share in rank_effects(run).items() if share >= 0.1}
+    # The verdict names the largest, in the order of the ladder.
+    texts = [describe_clause(one, run) for one in run.effects]
+    assert [text in list_lines(run)[0][1] for text in texts] == [True, False, True, True, False]
 
 
 def test_the_first_line_says_which_runs_are_simulated() -> None:

@@ -37,8 +37,8 @@ def test_what_people_act_on_is_no_smaller_effect() -> None:
     flat, round_ = (Named("wheel_radius", {"k": Number(k, k - 0.01, k + 0.01)}) for k in (0.85, 0.98))
     vague = Named("transport_delay", {"d": Number(0.4, 0.01, 0.8, "s")})
     effects = [lag, band, clock, late, flat, round_, vague]
-    assert split_main(effects, drawn.ladder) == ([lag, clock, late, flat], [band, round_, vague])
-    assert split_main([band, clock], drawn.ladder) == ([band, clock], [])
+    assert split_main(effects, drawn) == ([lag, clock, late, flat], [band, round_, vague])
+    assert split_main([band, clock], drawn) == ([band, clock], [])
 
 
 def test_every_effect_reads_well_in_a_verdict() -> None:
