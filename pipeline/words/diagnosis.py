@@ -231,12 +231,12 @@ def _list_main(run: RunDiagnosis) -> list[str]:
         texts.append(f"Undecided: {name_group(item.candidates)}")
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
     texts += _list_raising(run)
-    smaller = len(unseen) + len(minor)
+    folded = len(unseen) + len(minor)
     counts = [format_count(len(hidden), "more effect")] if hidden else []
-    counts += [format_count(smaller, "smaller effect")] if smaller else []
+    counts += [format_count(folded, "smaller effect")] if folded else []
     counts += [f"{len(small)} undecided"] if small else []
     if counts:
-        why = f"{BELOW_MAIN}; " if smaller else ""
+        why = f"{BELOW_MAIN}; " if folded else ""
         texts.append(f"{', and '.join(counts)} ({why}--all)")
     return texts
 
