@@ -380,7 +380,7 @@ class Budget(Table):
 class Parameters(Table):
     """One row a parameter of an effect that is missing from the ideal model, as in `diagnosis.json`."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     input = schemas.source()
     effect = schemas.name("id of the effect")
@@ -390,6 +390,7 @@ class Parameters(Table):
     high = schemas.optional("1", "upper end of it")
     unit = schemas.text("unit of value, low and high")
     at_bound = schemas.flag("the fit stopped at a bound of the search: the interval is not meaningful")
+    doubt = schemas.text("id of why it is not to be used as it stands, as in JSON; empty without a doubt")
 
 
 class Estimates(Table):

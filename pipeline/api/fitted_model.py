@@ -64,14 +64,24 @@ def tabulate_ladder(content: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame(rows, schema={"added": pl.String, **dict.fromkeys(_ERRORS, pl.Float64)})
 
 
-def tabulate_parameters(numbers: Mapping[str, Number]) -> pl.DataFrame:
-    """Numbers by ``effect.parameter``: value, 95 % interval (null without one), unit, id of its doubt."""
+def tabulate_parameters(
+    numbers: Mapping[str, Number], own: Mapping[str, Mapping[str, Number]]
+) -> pl.DataFrame:
+    """Numbers by ``effect.parameter``: value, 95 % interval (null without one), unit, id of its doubt, run.
+
+    Args:
+        numbers: by label.
+        own: those that runs have of their own, by label and run: a row each in place of the common one,
+            whose run is null.
+    """
     rows = [
-        (label, *map(finite_or_none, (one.value, one.low, one.high)), one.unit, one.doubt)
-        for label, one in numbers.items()
+        (label, *map(finite_or_none, (one.value, one.low, one.high)), number.unit, one.doubt, run)
+        for label, number in numbers.items()
+        for run, one in own.get(label, {None: number}).items()
     ]
     values = dict.fromkeys(("value", "low", "high"), pl.Float64)
-    schema = {"parameter": pl.String, **values, "unit": pl.String, "doubt": pl.String}
+    texts = dict.fromkeys(("unit", "doubt", "run"), pl.String)
+    schema = {"parameter": pl.String, **values, **texts}
     return pl.DataFrame(rows, schema=schema, orient="row")
 
 
@@ -222,8 +232,11 @@ class Model:
 
     @property
     def parameters(self) -> pl.DataFrame:
-        """Its numbers: ``parameter value low high unit``, the 95 % interval of the last fit."""
-        return tabulate_parameters(self.file.list_numbers())
+        """Its numbers: ``parameter value low high unit doubt run``, the 95 % interval of the last fit.
+
+        A number that runs have of their own has a row for each run.
+        """
+        return tabulate_parameters(self.file.list_numbers(), self.file.list_own())
 
     def __add__(self, other: str | Effect) -> Self:
         return self.of(replace(self.file, model=self.file.model + _take_effect(other)))

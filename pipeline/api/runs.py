@@ -340,7 +340,8 @@ class Diagnosis:
     Attributes:
         verdict: one to three sentences for people.
         effects: one row each: ``effect sentence``.
-        parameters: their numbers: ``parameter value low high unit``, a 95 % interval.
+        parameters: their numbers: ``parameter value low high unit doubt run``, a 95 % interval; one row a
+            run where runs have their own.
         ladder: held-out errors over 2 s, effect by effect: ``added t_mrmse_m r_mrmse_rad explained_share``.
         model: the model with these effects; None where nothing could be judged.
         suggestion: a formula as an effect, for what no effect explains; None without one.
@@ -366,7 +367,8 @@ class Diagnosis:
                 f"{one.id}.{name}": number
                 for one in diagnosis.effects
                 for name, number in one.parameters.items()
-            }
+            },
+            diagnosis.list_own(),
         )
         self.ladder = tabulate_ladder(content)
         file = read_diagnosed_model(diagnosis)

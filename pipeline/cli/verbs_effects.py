@@ -135,8 +135,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 def _suggest_next(runs: Sequence[results.RunDiagnosis], applying: str, applied: Path | None) -> str:
     """The next command: to export an applied model, to add a suggested term, or to apply."""
     if applied is not None:
-        kind = next((one.vehicle.kind for one in runs if one.vehicle is not None), "")
-        return words.suggest_export(kind, str(applied))
+        file = next(filter(None, map(results.read_model, runs)), None)
+        return "" if file is None else words.suggest_export(file, str(applied))
     if suggested := next((one.run for one in runs if one.has_suggestion), None):
         return f"slip serve {shlex.quote(suggested)}    add the suggested term there"
     return applying

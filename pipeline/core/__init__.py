@@ -121,6 +121,7 @@ else:
                 "Floats",
                 "Ints",
                 "RobustFit",
+                "bound_median",
                 "find_scale",
                 "fit_robustly",
                 "group_rows",

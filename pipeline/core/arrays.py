@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.core.text import FEWEST_OF_SPREAD
+from pipeline.core.text import CONFIDENCE, FEWEST_OF_SPREAD
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -54,6 +54,23 @@ def resample_median(values: Floats, times: Floats) -> Floats:
         return np.empty(0)
     drawn = np.random.default_rng(0).integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
     return np.array([np.median(values[np.concatenate([stretches[i] for i in one])]) for one in drawn])
+
+
+def bound_median(values: Floats, times: Floats) -> tuple[float, float] | None:
+    """95 % interval of a median over other stretches of ten seconds of the same driving.
+
+    Args:
+        values: shape (n,).
+        times: their times [s], increasing, shape (n,).
+
+    Returns:
+        None where there are fewer stretches than for a spread.
+    """
+    drawn = resample_median(values, times)
+    if not drawn.size:
+        return None
+    low, high = np.quantile(drawn, (0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE))).tolist()
+    return low, high
 
 
 def recur(values: Floats, factors: Floats) -> Floats:

@@ -441,7 +441,7 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
     Args:
         frame: a table without nested columns; numbers, also negative ones, are unchanged.
         header: whether the first line contains the column names.
-        digits: number of decimal places; None for all.
+        digits: significant digits; None for all.
 
     Raises:
         PolarsError: a column cannot be represented in CSV.
@@ -454,7 +454,8 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
         zip(frame.columns, names.to_frame("").select(quote_formulas(pl.col(""))).to_series(), strict=True)
     )
     texts = frame.with_columns(quote_formulas((cs.string() | cs.enum() | cs.categorical()).cast(pl.String)))
-    return texts.rename(safe).write_csv(include_header=header, float_precision=digits)
+    rounded = texts if digits is None else texts.with_columns(cs.float().round_sig_figs(digits))
+    return rounded.rename(safe).write_csv(include_header=header)
 
 
 def quote_formulas(text: pl.Expr) -> pl.Expr:

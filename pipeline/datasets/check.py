@@ -137,8 +137,9 @@ class CheckedNumber:
             alone where no runs tell how much runs differ.
         spread: how much runs differ, as a standard deviation; NaN where no runs tell.
         freedom: its degrees of freedom: runs that tell it, less one a group.
-        p: probability of a difference as large without a change; by the errors alone where no runs tell.
-        p_adjusted: p over all numbers of the check (Benjamini and Hochberg).
+        chance: probability of a difference as large by the errors of these recordings, and by `spread` where
+            runs tell it.
+        chance_adjusted: the same over all numbers of the check (Benjamini and Hochberg).
         smallest: change that these runs show with a probability of 80 %.
         size: largest change that may be missed of what is `unchanged`: distance of a parameter from doing
             nothing, at least the usual one; a doubling of errors; a quarter of the share of a commanded turn
@@ -158,15 +159,25 @@ class CheckedNumber:
     high: float = math.nan
     spread: float = math.nan
     freedom: float = 0.0
-    p: float = math.nan
-    p_adjusted: float = math.nan
+    chance: float = math.nan
+    chance_adjusted: float = math.nan
     smallest: float = math.nan
     size: float = 1.0
 
     @property
     def is_known(self) -> bool:
         """Whether both sides have an estimate."""
-        return math.isfinite(self.p)
+        return math.isfinite(self.chance)
+
+    @property
+    def p(self) -> float:
+        """Probability of a difference as large without a change; NaN where `spread` is not known."""
+        return self.chance if math.isfinite(self.spread) else math.nan
+
+    @property
+    def p_adjusted(self) -> float:
+        """`p` over all numbers of the check."""
+        return self.chance_adjusted if math.isfinite(self.spread) else math.nan
 
     @property
     def status(self) -> Status:
@@ -178,7 +189,7 @@ class CheckedNumber:
         """
         if not self.is_known:
             return "unknown"
-        if self.p_adjusted > CHANCE:
+        if self.chance_adjusted > CHANCE:
             return "unchanged" if self.low <= 0.0 <= self.high and not self.is_coarse else "not shown"
         return "changed" if math.isfinite(self.spread) else "differs"
 
@@ -189,9 +200,11 @@ class CheckedNumber:
 
     def to_json(self) -> dict[str, object]:
         """The row of `slip check --json`."""
-        numbers = {
-            key: finite_or_none(value) for key, value in vars(self).items() if isinstance(value, float)
-        }
+        names = (
+            *("before", "after", "after_low", "after_high", "difference", "low", "high"),
+            *("spread", "freedom", "p", "p_adjusted", "smallest", "size"),
+        )
+        numbers = {name: finite_or_none(getattr(self, name)) for name in names}
         change = "share" if self.is_ratio else "difference"
         return {"number": self.name, "unit": self.unit, "status": self.status, "change_is": change, **numbers}
 
@@ -364,12 +377,12 @@ def compare_sides(sides: Sides, limits: Limits | None = None, *, simulated: bool
             size = max(abs(before - neutral), abs(after - neutral), kind.usual_size)
             number = replace(number, before=before, after=after, size=size)
         numbers.append(number)
-    adjusted = adjust([finite_or_none(one.p) for one in numbers])
+    adjusted = adjust([finite_or_none(one.chance) for one in numbers])
     judged = [
-        replace(one, p_adjusted=math.nan if p is None else p)
+        replace(one, chance_adjusted=math.nan if p is None else p)
         for one, p in zip(numbers, adjusted, strict=True)
     ]
-    judged.sort(key=lambda one: (not one.is_known, one.p_adjusted, one.p if one.is_known else 0.0))
+    judged.sort(key=lambda one: (not one.is_known, one.chance_adjusted, one.chance if one.is_known else 0.0))
     check = RunsCheck(sides, tuple(judged))
     return (
         check if limits is None else replace(check, limits=tuple(_judge(limits, check, simulated=simulated)))
@@ -422,7 +435,7 @@ def _compare(blank: CheckedNumber, sides: Sides, *, simulated: bool, scale: floa
         high=show(one.high),
         spread=show(fit.spread) if is_known else math.nan,
         freedom=fit.freedom if is_known and not (simulated or is_set) else 0.0,
-        p=one.p,
+        chance=one.p,
         smallest=show(one.error * _count_errors(fit)),
     )
 

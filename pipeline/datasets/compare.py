@@ -26,7 +26,6 @@ from pipeline.datasets.pairs import (
     Group,
     SlipSamples,
     bound_groups,
-    bound_run,
     compare_groups,
     connect_groups,
     level_groups,
@@ -248,9 +247,9 @@ class _Comparison:
         return tabulate_pairs(rows, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
 
     def _bound_single(self, samples: Mapping[str, SlipSamples], name: str) -> Bounds:
-        """Intervals of runs that are alone in their dataset."""
+        """Intervals of medians of runs that are alone in their dataset: of the run, not of its terrain."""
         alone = self.compared.labels.filter(pl.len().over("group") == 1)["run"]
-        ends = {run: bound_run(samples[run]) for run in alone if run in samples}
+        ends = {run: samples[run].bound() for run in alone if run in samples}
         return {(run, name): one for run, one in ends.items() if one is not None}
 
     def _level_driving(
@@ -321,8 +320,7 @@ def _read_samples(
 
 def _take_samples(times: pl.Series, values: pl.Series) -> SlipSamples:
     order = times.arg_sort()
-    step = float(np.median(np.diff(times[order].to_numpy())))
-    return SlipSamples(values[order].to_numpy(), len(times) * step)
+    return SlipSamples(values[order].to_numpy(), times[order].to_numpy())
 
 
 def _find_families(
@@ -386,7 +384,7 @@ def _bound_published(groups: Sequence[Group], families: Mapping[str, Sequence[st
     for datasets in families.values():
         own = [group for group in groups if group.name in datasets]
         for group, ends in zip(own, bound_groups([group.values for group in own]), strict=True):
-            single = bound_run(group.runs[0]) if len(group.runs) == 1 and ends is None else None
+            single = group.runs[0].bound() if len(group.runs) == 1 and ends is None else None
             about = name_interval(len(group.runs)) if ends else THIS_RUN if single else ""
             low, high = ends or single or (None, None)
             rows.append(

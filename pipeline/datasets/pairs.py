@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, ROUNDING_S, STRETCH_S, Floats, finite_or_none, number_in
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    ROUNDING_S,
+    STRETCH_S,
+    Floats,
+    bound_median,
+    finite_or_none,
+    number_in,
+)
 from pipeline.datasets.equal_driving import Levelled, Overlap
 from pipeline.datasets.levels import LEVEL, Levels, fit_levels
 from schemas import contract_of
@@ -38,12 +46,21 @@ class SlipSamples:
     """Samples of one run.
 
     Attributes:
-        values: the compared quantity, ascending in time, shape (n,).
-        duration_s: time that they stand for [s]: their number times their usual step, without gaps.
+        values: the compared quantity, shape (n,).
+        times: their times [s], ascending, shape (n,).
     """
 
     values: Floats
-    duration_s: float
+    times: Floats
+
+    @property
+    def duration_s(self) -> float:
+        """Time that they stand for [s]: their number times their usual step, without gaps."""
+        return self.values.size * float(np.median(np.diff(self.times)))
+
+    def bound(self) -> tuple[float, float] | None:
+        """95 % interval of their median, the same as of the run's analysis."""
+        return bound_median(self.values, self.times)
 
     def cut(self, length_s: float) -> Floats:
         """Medians of at most `PARTS` parts of that length; the median of the run where none fits."""
@@ -96,11 +113,6 @@ def bound_groups(groups: Sequence[Floats]) -> list[tuple[float, float] | None]:
     fit = _fit_logarithms(groups)
     ends = [tuple(map(_exponentiate, fit.bound(i))) for i in range(len(groups))]
     return [(low, high) if fit.is_known else None for low, high in ends]
-
-
-def bound_run(run: SlipSamples) -> tuple[float, float] | None:
-    """Interval of one run's median from its parts; it is of this run, not of its terrain."""
-    return bound_groups([_cut_alike([run])[0]])[0]
 
 
 def _fit_logarithms(groups: Sequence[Floats], errors: Floats | None = None) -> Levels:

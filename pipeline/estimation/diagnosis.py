@@ -81,7 +81,7 @@ def _parameter_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
             **_cut(value, "value", "low", "high"),
             "unit": value.unit,
             "at_bound": value.at_bound,
-            "undetermined": value.is_undetermined,
+            "doubt": value.doubt,
         }
         for effect in item.effects
         for name, value in effect.parameters.items()

@@ -95,40 +95,47 @@ def _thin(curve: Curve) -> tuple[tuple[float, ...], tuple[float, ...]]:
 def measure_need(effects: Sequence[Named], widths: Mapping[str, Curve]) -> DataNeed | None:
     """How well the driven time determines the parameters of effects, and how much more is needed.
 
-    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger,
-    and open if its interval is as wide as the number itself (`Number.is_open`).
+    A value is known if no doubt is about it and the half-width of its interval is a twentieth of it, or of a
+    typical value if larger; open if it is in doubt, or its interval is as wide as the number itself
+    (`Number.is_open`). One that runs have of their own is known where it is in all of them. Of a number
+    without a curve, as a threshold, more driving is not known to narrow the interval: it is known or open.
 
     Args:
         effects: identified effects.
         widths: half-width of the 95 % interval by label ``effect.name``.
 
     Returns:
-        None where no identified effect has a curve.
+        None where no identified effect has a number that was fitted.
     """
     known, vague, needed, driven, small, open_ones = [], [], 0.0, 0.0, False, 0
     for effect in effects:
         for name, value in effect.parameters.items():
-            label = f"{effect.id}.{name}"
-            curve = widths.get(label)
-            if curve is None:
+            if effect.corrected or not math.isfinite(value.value):
                 continue
-            half, goal = float(curve.values[-1]), find_goal(effect.id, name, value.value)
-            if value.is_open(find_effect(effect.id)().parameter(name)) or not half < goal / INTERVAL_SHARE:
+            label = f"{effect.id}.{name}"
+            curve, parameter = widths.get(label), find_effect(effect.id)().parameter(name)
+            values = [one[name] for one in effect.by_run] if name in effect.own else [value]
+            half = max(one.half for one in values) if curve is None else float(curve.values[-1])
+            goal = find_goal(effect.id, name, value.value)
+            is_open = any(one.doubt or one.is_open(parameter) for one in values)
+            if is_open or not half < goal / INTERVAL_SHARE or (curve is None and half > goal):
                 open_ones += 1
                 continue
-            since = last_until(curve, goal)
-            driven = max(driven, float(curve.seconds[-1]))
-            needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
-            if math.isfinite(since):
+            since = math.nan
+            if curve is not None:
+                since = last_until(curve, goal)
+                driven = max(driven, float(curve.seconds[-1]))
+                needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
+            if curve is not None and math.isinf(since):
+                vague.append((half / goal, label, half, value.unit, curve, goal))
+            else:
                 known.append((since, label))
                 small |= half > INTERVAL_SHARE * abs(value.value)
-            else:
-                vague.append((half / goal, label, half, value.unit, curve, goal))
     if not (known or vague or open_ones):
         return None
     need = DataNeed(
-        tuple(label for _, label in sorted(known)),
-        max(known)[0] if known else math.nan,
+        tuple(label for _, label in sorted(known, key=lambda one: (math.isnan(one[0]), one))),
+        float(np.max([since for since, _ in known])) if known else math.nan,
         driven,
         is_typical=small,
         open=open_ones,

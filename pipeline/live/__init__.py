@@ -224,7 +224,8 @@ def list_known(diagnosis: RunDiagnosis, before: Sequence[str] | None) -> list[di
             **pick_finite(value, "value", "low", "high"),
             "unit": value.unit,
             "is_known": not is_open(effect.id, name, value),
-            "is_narrow": 0.5 * (value.high - value.low) <= find_goal(effect.id, name, value.value),
+            "is_narrow": not value.doubt
+            and 0.5 * (value.high - value.low) <= find_goal(effect.id, name, value.value),
         }
         for effect in diagnosis.effects
         if not effect.corrected and (before is None or (effect.id in passing and effect.id in before))

@@ -42,9 +42,11 @@ from pipeline.results import (
     key_finding,
     read_finding_table,
     read_findings,
+    read_model,
     split_main,
 )
 from pipeline.words import (
+    BELOW_MAIN,
     Cell,
     Column,
     Table,
@@ -228,8 +230,8 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
         steps.append(("Add the suggested term, and see the error fall", f"slip serve {name}"))
     if diagnosis.effects:
         steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
-        kind = "" if diagnosis.vehicle is None else diagnosis.vehicle.kind
-        steps.append(("Export it to the controller", suggest_export(kind, "model.toml")))
+        if (file := read_model(diagnosis)) is not None:
+            steps.append(("Export it", suggest_export(file, "model.toml")))
         against = f"slip model compare model.toml --against literature --on {name}"
         steps.append(("Compare it with models of the literature", against))
     if diagnosis.undecided or diagnosis.unobservable_why:
@@ -391,7 +393,7 @@ def format_remaining(report: RunReport) -> str:
 def view_why(report: RunReport) -> dict[str, object]:
     """Effects, open questions, and the split in one sentence."""
     diagnosis = report.diagnosis
-    main, minor = split_main(diagnosis.effects, diagnosis.ladder)
+    main, minor = split_main(diagnosis.effects, diagnosis)
     rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
     split = report.part("split")
     drivetrain, ground, cross = (number_in(split, name) for name in ("drivetrain", "ground", "cross"))
@@ -400,8 +402,9 @@ def view_why(report: RunReport) -> dict[str, object]:
         "diagnosed": report.is_diagnosed,
         "named": [_view_effect(report, entry) for entry in main],
         "smaller": [_view_effect(report, entry) for entry in minor],
+        "below": BELOW_MAIN,
         # A group that counts as one smaller effect.
-        "groups": sum(is_small(group.in_model, diagnosis.ladder) for group in diagnosis.undecided),
+        "groups": sum(is_small(group.in_model, diagnosis) for group in diagnosis.undecided),
         "undecided": bool(diagnosis.undecided),
         "remaining": format_remaining(report),
         "table": Table("Effects", _HEAD, rows),

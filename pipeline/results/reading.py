@@ -52,7 +52,7 @@ DETECTED_SHARE = 90
 INTERVAL_SHARE = 0.05
 """Target half-width of a 95 % interval as a share of the parameter's size."""
 _MAIN_SHARE = 0.1
-"""Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
+"""Of an error of the ideal model: an effect that removes less of every one is a smaller one."""
 
 
 def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
@@ -139,52 +139,53 @@ def list_added(before: Step, after: Step) -> list[str]:
     return [name for name in after.effects if name not in before.effects]
 
 
-def rank_effects(ladder: Sequence[Step]) -> dict[str, float]:
+def rank_effects(run: RunDiagnosis) -> dict[str, float]:
     """Effects in the order in which they are listed everywhere: that of the ladder.
 
     Returns:
-        The share of the ideal model's error over 2 s that each removes, in position or heading, by id.
+        The largest share of an error of the ideal model that each removes, by id: of the errors over 2 s at
+        its step of the ladder, and of every error budget of the leading input.
     """
     shares: dict[str, float] = {}
-    for before, after in pairwise(ladder):
+    for before, after in pairwise(run.ladder):
         falls = [
             fall
             for key in ERRORS_OVER_2S
-            if (ideal := getattr(ladder[0], key))
+            if (ideal := getattr(run.ladder[0], key))
             and math.isfinite(fall := (getattr(before, key) - getattr(after, key)) / ideal)
         ]
         for name in list_added(before, after):
             shares.setdefault(name, max(falls, default=0.0))
+    for budget in run.budget:
+        for one in budget.shares:
+            if budget.input == run.input and one.effect in shares and math.isfinite(one.share):
+                shares[one.effect] = max(shares[one.effect], one.share)
     return shares
 
 
-def rank_main(ladder: Sequence[Step]) -> dict[str, float]:
-    """Those of `rank_effects` up to the last one that removes a tenth of the error, at least one effect.
-
-    What removes less before it stays in the list, so that each error continues from the one above.
-    """
-    ranked = rank_effects(ladder)
-    large = [number for number, share in enumerate(ranked.values()) if share >= _MAIN_SHARE]
-    return dict([*ranked.items()][: max([*large, 0]) + 1])
+def rank_main(run: RunDiagnosis) -> dict[str, float]:
+    """Those of `rank_effects` that remove a tenth of an error, at least the largest one."""
+    ranked = rank_effects(run)
+    least = min(_MAIN_SHARE, round_digits(max(ranked.values(), default=0.0), JSON_DIGITS))
+    return {name: share for name, share in ranked.items() if round_digits(share, JSON_DIGITS) >= least}
 
 
-def split_main(effects: Sequence[Named], ladder: Sequence[Step]) -> tuple[list[Named], list[Named]]:
+def split_main(effects: Sequence[Named], run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
     """The effects of `rank_main` with those that stand out (`Named.stands_out`), and the smaller effects.
 
     Returns:
         Main and smaller effects in their order; where `rank_main` lists none, all are main.
     """
-    first = rank_main(ladder)
+    first = rank_main(run)
     if not first.keys() & {effect.id for effect in effects}:
         return list(effects), []
     main = [effect for effect in effects if effect.id in first or effect.stands_out]
     return main, [effect for effect in effects if effect not in main]
 
 
-def is_small(name: str | None, ladder: Sequence[Step]) -> bool:
+def is_small(name: str | None, run: RunDiagnosis) -> bool:
     """Whether the ladder contains an effect that `rank_main` does not list."""
-    ids = {added for before, after in pairwise(ladder) for added in list_added(before, after)}
-    return name in ids - set(rank_main(ladder))
+    return name in rank_effects(run).keys() - rank_main(run).keys()
 
 
 def list_excess(run: RunDiagnosis) -> dict[str, float]:

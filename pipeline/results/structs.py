@@ -445,14 +445,15 @@ class DataNeed(msgspec.Struct, frozen=True):
     """How well the driven time determines the parameters, and how much more is needed.
 
     Attributes:
-        known: labels of the parameters that are known to a twentieth.
-        since_s, driven_s: after which time the last of them was, and the whole [s].
+        known: labels of the parameters that are known to a twentieth, and in no doubt.
+        since_s, driven_s: after which time the last of them was, and the whole [s]; NaN where one of them has
+            no interval by driving time.
         is_typical: whether the twentieth is of a typical value for one of them.
         vague: label of the least known one; empty without.
         half_width, unit: of its interval.
         others: how many more are not known to a twentieth.
         minutes: more minutes of such driving for it; 0 where driving does not narrow its interval.
-        open: parameters that are not determined.
+        open: parameters that are not determined, or in doubt.
         idle_share: of the drive, at its end, that narrowed no interval by more than a tenth.
     """
 
@@ -498,7 +499,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
         concentrated: the region with most of the error of the final model; None where it is spread evenly.
         model: model file with the identified effects, fitted, as text; None where no model could be judged.
         budget: causes of the slip and of the 2 s errors of the ideal model, for each input.
-        need: whether the log is long enough; None where no effect has a curve.
+        need: whether the log is long enough; None where no effect has a number that was fitted.
         commanded_turn: share of the commanded yaw rate that the robot reaches; None without a body command.
         asked: the largest motion that the run asks for; None where nothing was fitted.
     """
@@ -529,6 +530,17 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     need: DataNeed | None = None
     commanded_turn: CommandedTurn | None = None
     asked: Asked | None = None
+
+    def list_own(self) -> dict[str, dict[str, Number]]:
+        """Numbers that runs judged together have of their own: by label ``effect.name``, then by run."""
+        return {
+            f"{effect.id}.{name}": {
+                run: numbers[name] for run, numbers in zip(self.joint, effect.by_run, strict=True)
+            }
+            for effect in self.effects
+            for name in effect.parameters
+            if name in effect.own
+        }
 
     @property
     def has_suggestion(self) -> bool:

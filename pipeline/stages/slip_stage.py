@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import CONFIDENCE, Flags, Floats, resample_median
+from pipeline.core import Flags, Floats, bound_median
 from pipeline.recording import Finding, StageError
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
@@ -370,9 +370,7 @@ def _summarize_input(aggregates: pl.DataFrame, slip: pl.DataFrame, name: str) ->
     rows = {subset: pick_row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
     whole = rows["all"]
     known = slip.filter(pl.col("input").cast(pl.String) == name, COUNTED)
-    drawn = resample_median(known["modulus"].to_numpy(), known["t"].to_numpy())
-    ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
-    low, high = np.quantile(drawn, ends).tolist() if drawn.size else (None, None)
+    low, high = bound_median(known["modulus"].to_numpy(), known["t"].to_numpy()) or (None, None)
     return {
         "samples": int(whole["samples"] or 0),
         "windows": int(whole["windows"] or 0),

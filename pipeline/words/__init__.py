@@ -57,6 +57,7 @@ else:
                 "format_short",
                 "format_suggestion",
                 "list_findings",
+                "BELOW_MAIN",
                 "list_largest_falls",
                 "list_terms",
             ),

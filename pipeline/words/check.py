@@ -151,7 +151,7 @@ def describe_change(number: CheckedNumber) -> str:
 
 def _format_p(number: CheckedNumber) -> str:
     """P over all numbers; empty where no runs tell how much runs differ."""
-    if not math.isfinite(number.spread):
+    if not math.isfinite(number.p_adjusted):
         return ""
     return f"{number.p_adjusted:.1g}" if number.p_adjusted >= 1e-4 else "< 0.0001"  # noqa: PLR2004 - as many digits as are shown
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from pipeline.core import (
     INPUT_WORDS,
+    format_count,
     format_part,
     format_share,
     group_by,
@@ -35,6 +36,7 @@ from pipeline.results import (
     list_added,
     list_rises,
     measure_excess,
+    rank_main,
     split_main,
 )
 from pipeline.run import HORIZON_S
@@ -48,6 +50,7 @@ from pipeline.words.effects import (
     is_clock,
     is_open,
     name_group,
+    name_scope,
     suggest_drive,
 )
 from pipeline.words.errors import (
@@ -105,7 +108,9 @@ _FINDINGS_SHOWN = 3
 _HEADS_SHOWN = 4
 """Most runs that are named one a line by default; the names of more are between the first and the last."""
 _EFFECTS_SHOWN = 5
-"""Effects with a line by default."""
+"""Effects with a line by default, the largest ones; what stands out has one beside them."""
+BELOW_MAIN = "each below a tenth of every error"
+"""Which effects are the smaller ones."""
 
 
 def has_dead_encoder(findings: Iterable[Finding]) -> bool:
@@ -218,10 +223,13 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     named = [one for one in main if one.id not in undecided]
     shown = [one for one in named if falls.get(one.id) != _UNCHANGED or one.stands_out]
     unseen = [one for one in named if one not in shown]
-    folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor)
+    ranked = rank_main(run)
+    by_share = sorted((one.id for one in shown if one.id in ranked), key=lambda name: -ranked[name])
+    hidden = by_share[_EFFECTS_SHOWN:]
     rows = [
         (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
-        for effect in shown[:_EFFECTS_SHOWN]
+        for effect in shown
+        if effect.id not in hidden
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     texts = [
@@ -232,10 +240,13 @@ def _list_main(run: RunDiagnosis) -> list[str]:
         texts.append(f"Undecided: {name_group(item.candidates)}")
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
     texts += _list_raising(run)
-    counts = [f"{folded} smaller effect{'s' * (folded > 1)}"] if folded else []
+    folded = len(unseen) + len(minor)
+    counts = [format_count(len(hidden), "more effect")] if hidden else []
+    counts += [format_count(folded, "smaller effect")] if folded else []
     counts += [f"{len(small)} undecided"] if small else []
     if counts:
-        texts.append(f"{', and '.join(counts)} (--all)")
+        why = f"{BELOW_MAIN}; " if folded else ""
+        texts.append(f"{', and '.join(counts)} ({why}--all)")
     return texts
 
 
@@ -259,7 +270,10 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
         for before, after in pairwise(run.ladder)
         for name in list_added(before, after)
     }
-    return falls | {one.id: _describe_correction(one, run) for one in run.effects if one.corrected}
+    falls |= {one.id: _describe_correction(one, run) for one in run.effects if one.corrected}
+    ranked = rank_main(run)
+    large = [one.id for one in run.effects if one.id not in ranked and one.stands_out and not one.corrected]
+    return falls | {name: f"{falls[name]}, listed for its large value" for name in large if name in falls}
 
 
 def _describe_correction(effect: Named, run: RunDiagnosis) -> str:
@@ -273,10 +287,8 @@ def format_short(effect: Named) -> str:
 
     The name of an effect of one number with a unit says what it is: `yaw rate limit: limit = 1.01 rad/s`.
     """
-    if is_clock(effect) and effect.by_run:
-        return "one offset a run"
     if effect.own:
-        return _format_by_ground(effect)
+        return _format_own(effect)
     if not effect.shown:
         return ""
     known = list(effect.shown.items())
@@ -300,8 +312,8 @@ def format_short(effect: Named) -> str:
     return "; ".join([*shown, *([f"{hidden} more"] if hidden else [])])
 
 
-def _format_by_ground(effect: Named) -> str:
-    """The range over the terrains of the first value that differs between them and is known."""
+def _format_own(effect: Named) -> str:
+    """The range over runs or terrains of the first value that differs between them and is known."""
     for name in filter(effect.own.__contains__, effect.parameters):
         known = [one[name] for one in effect.by_run if not one[name].is_undetermined]
         if known:
@@ -309,9 +321,9 @@ def _format_by_ground(effect: Named) -> str:
             ends = dict.fromkeys(f"{round_digits(one.value, one.digits):.3g}" for one in (low, high))
             about = describe_number(effect.id, name)
             elsewhere = " where it is known" if len(known) < len(effect.by_run) else ""
-            text = f"{name} = {' to '.join(ends)}{suffix_unit(low.unit)} by terrain{elsewhere}"
+            text = f"{name} = {' to '.join(ends)}{suffix_unit(low.unit)} {name_scope(effect)}{elsewhere}"
             return f"{text}, {about}" if about else text
-    return "open on every terrain"
+    return "open in every run" if is_clock(effect) else "open on every terrain"
 
 
 def _format_largest_fall(before: Step, after: Step) -> str:
@@ -380,7 +392,7 @@ def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named], list[Na
     """
     unknown = [effect for effect in run.effects if not effect.is_determined]
     known = [effect for effect in run.effects if effect.is_determined]
-    return *split_main(known, run.ladder), unknown
+    return *split_main(known, run), unknown
 
 
 def _format_unknown(run: RunDiagnosis) -> str:
@@ -401,7 +413,7 @@ def _list_unknown(effect: Named) -> list[str]:
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
     """Groups with an effect that removes a tenth of the error or with none in the model; smaller groups."""
-    small = [item for item in run.undecided if is_small(item.in_model, run.ladder)]
+    small = [item for item in run.undecided if is_small(item.in_model, run)]
     return [item for item in run.undecided if item not in small], small
 
 
@@ -548,7 +560,7 @@ def _list_shared(effect: Named) -> dict[str, Number]:
 
 
 def _format_values(effect: Named, shared: Mapping[str, Number]) -> str:
-    return "a clock offset of each run:" if is_clock(effect) and effect.by_run else _format_all(shared)
+    return f"{name_scope(effect)}:" if effect.own and not shared else _format_all(shared)
 
 
 def _format_all(numbers: Mapping[str, Number]) -> str:

@@ -51,22 +51,35 @@ def is_open(effect: str, name: str, number: Number) -> bool:
     return number.is_undetermined if kind is None else number.is_open(kind().parameter(name))
 
 
-def _list_ends(name: str, values: Mapping[str, Number]) -> list[Mapping[str, Number]]:
-    """The values of an effect; of one number that its interval leaves open, both ends of it."""
-    wide = [key for key, one in values.items() if not one.is_undetermined and is_open(name, key, one)]
+def _list_ends(effect: Named) -> list[Mapping[str, Number]]:
+    """The values between which an effect is, in their order.
+
+    Where runs or grounds have their own, those that are determined; of one number that its interval leaves
+    open, both ends of it.
+    """
+    values = effect.parameters
+    if own := sorted(effect.own):
+        known = [one for one in effect.by_run if not any(value.is_undetermined for value in one.values())]
+        return sorted(known, key=lambda one: one[own[0]].value) or [values]
+    wide = [key for key, one in values.items() if not one.is_undetermined and is_open(effect.id, key, one)]
     if len(values) != 1 or not wide:
         return [values]
     return [{key: Number(end)} for key in wide for end in (values[key].low, values[key].high)]
 
 
 def describe_motion(effect: Named, run: RunDiagnosis) -> str:
-    """What the vehicle does by an effect, with its values beside the other effects of the model."""
+    """What the vehicle does by an effect, with its values beside the other effects of the model.
+
+    Where runs or grounds have their own values, it is a range, or says by what they differ.
+    """
     vehicle = run.vehicle
     if vehicle is None or effect.id not in _list_known():
         return name_term(effect.id)
-    effects = [restore_known(effect.id, one) for one in _list_ends(effect.id, effect.parameters)]
+    effects = [restore_known(effect.id, one) for one in _list_ends(effect)]
     texts = [one.describe_motion(vehicle, _list_beside(run), run.asked) for one in effects]
-    return _join_range(texts) or " to ".join(texts)
+    joined = "" if len(effect.own) > 1 else _join_range(texts)
+    otherwise = f"{name_term(effect.id).capitalize()}: its values differ {name_scope(effect)}"
+    return joined or (otherwise if effect.own else " to ".join(texts))
 
 
 def describe_clause(effect: Named, run: RunDiagnosis) -> str:
@@ -78,11 +91,9 @@ def describe_clause(effect: Named, run: RunDiagnosis) -> str:
     vehicle = run.vehicle
     if vehicle is None or effect.id not in _list_known():
         return ""
-    values = _list_ends(effect.id, effect.parameters)
-    if effect.own:
-        values = [one for one in effect.by_run if not any(value.is_undetermined for value in one.values())]
-    effects, beside = [restore_known(effect.id, one) for one in values], _list_beside(run)
-    return _join_range([one.describe_clause(vehicle, beside, run.asked) for one in effects])
+    effects, beside = [restore_known(effect.id, one) for one in _list_ends(effect)], _list_beside(run)
+    texts = [one.describe_clause(vehicle, beside, run.asked) for one in effects]
+    return "" if len(effect.own) > 1 else _join_range(texts)
 
 
 @lru_cache(maxsize=8)
@@ -97,22 +108,37 @@ def _list_beside(run: RunDiagnosis) -> tuple[Effect, ...]:
 
 
 def _join_range(texts: Sequence[str]) -> str:
-    """Texts that differ in one number as one text with its range; empty where they differ otherwise."""
+    """Texts of ascending values of one number as one text with its ranges; empty where they differ otherwise.
+
+    They differ in numbers, perhaps with unit and side: `poses are stamped 20 ms early to 0.25 s late`.
+    """
     rows = [text.split(" ") for text in texts]
     if len({len(row) for row in rows}) != 1:
         return ""
-    words, ranges = [], 0
-    for column in zip(*rows, strict=True):
-        if len(set(column)) == 1:
-            words.append(column[0])
-            continue
+    words: list[str] = []
+    end = 0
+    for first, last in _list_unlike(rows):
+        values = [row[first:last] for row in rows]
         try:
-            low, high = (pick(column, key=float) for pick in (min, max))
+            numbers = [float(number) for number, *_ in values]
         except ValueError:
             return ""
-        words.append(f"{low} to {high}")
-        ranges += 1
-    return " ".join(words) if ranges <= 1 else ""
+        if last - first == 1:
+            # A share may fall where the value grows.
+            values = [one for _, one in sorted(zip(numbers, values, strict=True))]
+        words += [*rows[0][end:first], *values[0], "to", *values[-1]]
+        end = last
+    return " ".join([*words, *rows[0][end:]])
+
+
+def _list_unlike(rows: Sequence[Sequence[str]]) -> list[tuple[int, int]]:
+    """First word and end of each part in which rows of words differ; one common word does not part them."""
+    parts: list[tuple[int, int]] = []
+    for number, column in enumerate(zip(*rows, strict=True)):
+        if len(set(column)) > 1:
+            near = parts and number - parts[-1][1] <= 1
+            parts[-1:] = [(parts[-1][0], number + 1)] if near else [*parts[-1:], (number, number + 1)]
+    return parts
 
 
 def describe_number(effect: str, parameter: str) -> str:
@@ -136,6 +162,11 @@ def is_clock(effect: Named) -> bool:
     """Whether it is a clock, of which each run has its own."""
     kind = _list_known().get(effect.id)
     return kind is not None and kind.late is Late.POSES
+
+
+def name_scope(effect: Named) -> str:
+    """Between what its own values differ."""
+    return "by run" if is_clock(effect) else "by terrain"
 
 
 def describe_cause(effect: Named) -> str:

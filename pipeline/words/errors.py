@@ -16,6 +16,7 @@ from pipeline.core import (
     format_share,
     group_by,
 )
+from pipeline.models import FEW_STRETCHES, TOO_SHORT
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
@@ -269,10 +270,11 @@ def describe_rest(run: RunDiagnosis) -> str:
 def describe_need(run: RunDiagnosis) -> str:
     """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
 
-    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger.
+    A value is known if no doubt is about it and the half-width of its interval is a twentieth of it, or of a
+    typical value if larger.
 
     Returns:
-        A sentence or two; empty where no identified effect has a growth curve.
+        A sentence or two; empty where no identified effect has a number that was fitted.
     """
     need = run.need
     if need is None:
@@ -286,8 +288,15 @@ def describe_need(run: RunDiagnosis) -> str:
     sentences = [f"{who} {verb} known within {_GOAL}{scale}"]
     if known == 0 and count == 1:
         sentences = [f"the one parameter is not known within {_GOAL}"]
-    if known == count:
+    if known == count and math.isfinite(need.since_s):
         sentences[0] += f", after {need.since_s:.0f} s of {need.driven_s:.0f} s"
+    few = group_by(
+        (number.reason, f"{effect.id}.{name}")
+        for effect in run.effects
+        for name, number in effect.parameters.items()
+        if number.doubt in {FEW_STRETCHES, TOO_SHORT}
+    )
+    sentences += [f"{', '.join(labels)}: {reason}" for reason, labels in few.items()]
     others = "the others" if known else "it" if count == 1 else "them"
     if need.vague and not is_brief:
         sentences.append(

@@ -22,7 +22,7 @@ from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.estimation.transfer import Transfer, describe_beyond, describe_remaining
-from pipeline.models import Number
+from pipeline.models import ModelFile, Number
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors
 from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall, format_rises
@@ -197,9 +197,20 @@ _TARGETS = {"differential": "ros2_control", "ackermann": "autoware", "mecanum": 
 """By the kind of a vehicle: the export that takes most of its effects and needs no other file."""
 
 
-def suggest_export(kind: str, model: str) -> str:
-    """The command that exports the model of a kind of vehicle; other kinds have their numbers as JSON."""
-    return f"slip model export {shlex.quote(model)} --to {_TARGETS.get(kind, 'json')}"
+def suggest_export(file: ModelFile, path: str) -> str:
+    """The command that exports a model, by the kind of its vehicle; other kinds have their numbers as JSON.
+
+    Controllers get no value in doubt: a model of which all are is suggested as a function of Python.
+    """
+    acting = {
+        f"{effect.id}.{parameter.name}"
+        for effect in file.model
+        for parameter in effect.parameters
+        if math.isfinite(value := effect.values[parameter.name]) and value != parameter.neutral
+    }
+    is_known = not acting or bool(acting - set(file.list_doubtful()))
+    target = _TARGETS.get(file.model.vehicle.kind, "json") if is_known else "python"
+    return f"slip model export {shlex.quote(path)} --to {target}"
 
 
 def list_omitted(doubtful: Mapping[str, Number]) -> list[str]:

@@ -69,7 +69,7 @@ def format_verdict(run: RunDiagnosis) -> str:
     rest += [text] if (text := "; ".join(filter(None, _list_open_ends(run)))) else []
     remaining = f"{format_step(ladder[-1])} remain{_compare(run)}"
     verdict = ""
-    for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
+    for count in range(len(clauses), -1, -1):
         clause = f"{_join_clauses(clauses[:count])}; " if count else ""
         after = f"{clause}with {_name_model(ladder[-1], count)} in the model {remaining}"
         verdict = _join(opening, *([after] if is_sized else filter(None, [clause[:-2]])), *rest)
@@ -144,16 +144,22 @@ def _suggest(run: RunDiagnosis) -> str:
 
 
 def _list_clauses(run: RunDiagnosis) -> list[str]:
-    """What the robot does by each main effect of the ladder, in its order."""
+    """What the robot does by the largest of the main effects, in the order of the ladder."""
     undecided = {one.in_model for one in run.undecided}
     named = {one.id: one for one in run.effects if one.is_determined}
-    chosen = [named[name] for name in rank_main(run.ladder) if name in named and name not in undecided]
-    return [clause for one in chosen if (clause := describe_clause(one, run))]
+    ranked = rank_main(run)
+    clauses = {
+        name: clause
+        for name in ranked
+        if name in named and name not in undecided and (clause := describe_clause(named[name], run))
+    }
+    largest = sorted(clauses, key=lambda name: -ranked[name])[:_MOST_CLAUSES]
+    return [clause for name, clause in clauses.items() if name in largest]
 
 
 def _describe_choice(run: RunDiagnosis) -> str:
     """The main effect that the log does not name, as a clause: `this log does not decide between A and B`."""
-    main = rank_main(run.ladder)
+    main = rank_main(run)
     chosen = next((one for one in run.undecided if one.in_model in main), None)
     if chosen is None:
         return ""

@@ -8,12 +8,16 @@ from typing import Any
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
+from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 from verbs import ask_verb
 
 import slip
 from pipeline.results import Unexplained
 from pipeline.simulate import simulate_case
+from pipeline.words import diagnosis_as_json
+from pipeline.words.diagnosis import describe
+from pipeline.words.effects import format_numbers
 
 EFFECT = "effective_track"
 ROOT = Path(__file__).parents[2]
@@ -86,6 +90,50 @@ def test_what_a_suggested_formula_leaves_is_one_number_on_every_face(tmp_path: P
     for key in ("t_mrmse_m", "r_mrmse_rad"):
         assert told["with_formula"][key] == pytest.approx(errors[key], rel=1e-4)
         assert best[key] == pytest.approx(errors[key], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("clock_offset", ({"d": 0.252}, {"d": -0.02}), "stamped 20 ms early to 0.25 s late"),
+        ("effective_track", ({"k": 2.0}, {"k": 1.25}), "50 to 80 %"),
+        ("turn_lag", ({"tau_mean": 0.2, "tau_diff": 0.4}, {"tau_mean": 0.3, "tau_diff": 0.1}), "differ"),
+    ],
+)
+def test_what_runs_have_of_their_own_is_of_every_run_on_every_face(
+    name: str, values: tuple[dict[str, float], ...], said: str
+) -> None:
+    errors = [(1.0, 0.5), (0.05, 0.02)]
+    drawn = draw_diagnosis({name: values[0]}, errors, joint=["field/a", "field/b"], input="command")
+    (effect,) = drawn.effects
+    by_run = tuple(
+        {
+            key: replace(effect.parameters[key], value=value, low=value, high=value)
+            for key, value in own.items()
+        }
+        for own in values
+    )
+    told = slip.Diagnosis(replace(drawn, effects=(replace(effect, by_run=by_run),)), {}, dict)
+
+    assert list(told.parameters.select("parameter", "run", "value").iter_rows()) == [
+        (f"{name}.{key}", run, own[key])
+        for key in values[0]
+        for run, own in zip(drawn.joint, values, strict=True)
+    ]
+    assert said in str(told.effects["sentence"].item())
+    runs = [
+        replace(drawn, run=run, effects=(replace(effect, parameters=own, by_run=by_run),))
+        for run, own in zip(drawn.joint, by_run, strict=True)
+    ]
+    assert {diagnosis_as_json(one)["effects"][0]["sentence"] for one in runs} == {
+        told.effects["sentence"].item()
+    }
+    screen = describe(runs, everything=True)
+    assert said in screen
+    for run, own in zip(drawn.joint, by_run, strict=True):
+        assert f"{format_numbers(own)} in {run}" in screen
+    low, high = sorted(own[next(iter(own))] for own in values)
+    assert f"{low:.3g} to {high:.3g}" in describe(runs)
 
 
 def test_what_the_analysis_found_is_not_looked_for_again(

@@ -33,6 +33,8 @@ def test_other_texts_and_all_numbers_stay() -> None:
 def test_tables_of_comparisons_hold_no_formula() -> None:
     frame = pl.DataFrame({"dataset": ["=cmd"], "terrain": ["@ice"], "median": [-0.123456789]})
     assert format_csv(frame, digits=6) == "dataset,terrain,median\n'=cmd,'@ice,-0.123457\n"
+    small = pl.DataFrame({"p": [2.7182818e-10, 0.0, None], "n": [123456789.0, 1.0, 2.0]})
+    assert format_csv(small, digits=6) == "p,n\n2.71828e-10,123457000.0\n0.0,1.0\n,2.0\n"
 
 
 def test_one_function_writes_all_csv() -> None:

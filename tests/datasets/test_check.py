@@ -7,9 +7,12 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import polars as pl
 import pytest
 from motion_runs import simulate, vehicle_of
 
+import slip
+from pipeline.core import objects_in
 from pipeline.datasets import ComparisonError
 from pipeline.datasets.check import (
     BROKEN,
@@ -136,22 +139,39 @@ def test_one_run_a_side_cannot_tell_on_any_face_and_shows_the_table(same: Sides,
         assert all(any(title in text for _, text in list_check_lines(found)) for title in titles)
         # A probability of a change needs to know how much runs differ.
         assert not any("p <" in face or "p =" in face for face in faces)
+        rows = {str(row["number"]): row for row in objects_in(content, "numbers")}
+        assert {row["p"] for row in rows.values() if row["spread"] is None} == {None}
+        assert {row["p_adjusted"] for row in rows.values() if row["spread"] is None} == {None}
+        assert rows[LAG]["spread"] is None
+        unknown = slip.Check(found).numbers.filter(pl.col("spread").is_null())
+        assert unknown.height == unknown["p"].null_count() >= len(found.sides.labels)
 
 
 def test_what_its_interval_or_its_width_leaves_open_is_not_called_unchanged(same: Sides) -> None:
-    known = {"p": 0.016, "p_adjusted": 0.137, "spread": 0.1, "freedom": 4.0, "before": 0.23, "after": 0.35}
-    blank = CheckedNumber(COMMANDED_TURN, "share of asked yaw rate", "1", is_ratio=True, size=0.25)
+    blank = CheckedNumber(
+        COMMANDED_TURN,
+        "share of asked yaw rate",
+        "1",
+        is_ratio=True,
+        before=0.23,
+        after=0.35,
+        spread=0.1,
+        freedom=4.0,
+        chance=0.016,
+        chance_adjusted=0.137,
+        size=0.25,
+    )
     for low, high, smallest, status in (
         (0.08, 1.04, 0.2, "not shown"),
         (-0.1, 0.2, 0.6, "not shown"),
         (-0.1, 0.2, 0.2, "unchanged"),
     ):
-        number = replace(blank, difference=0.5 * (low + high), low=low, high=high, smallest=smallest, **known)
+        number = replace(blank, difference=0.5 * (low + high), low=low, high=high, smallest=smallest)
         assert number.status == status
         found = RunsCheck(same, (number,))
         (row,) = (line for line in list_check_lines(found) if line[0] == status)
         assert re.search(r"\] +0\.1$", row[1]), "the p over all numbers stands beside the word"
-    single = replace(blank, difference=0.5, low=0.08, high=1.04, smallest=0.2, **known)
+    single = replace(blank, difference=0.5, low=0.08, high=1.04, smallest=0.2)
     assert "Not shown beyond chance, but near: share of asked yaw rate 0.23 -> 0.35" in format_check(
         RunsCheck(same, (single,))
     )

@@ -15,6 +15,7 @@ from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pairs import Group, SlipSamples, compare_groups
 from pipeline.recording import Finding
 from pipeline.report.datasets_page import _draw_levels, write_answer
+from pipeline.stages.slip_stage import summarize_inputs
 from pipeline.store import Store
 
 TERRAINS = {"asphalt": 0.5, "gravel": 1.0, "ice": 2.0}
@@ -64,6 +65,20 @@ def test_five_runs_a_side_tell_terrains_apart(store: Store) -> None:
     for row in rows.iter_rows(named=True):
         assert row["low"] < row["median_modulus"] < row["high"]
         assert f"{row['terrain']}_0/k0" in row["keys"]
+
+
+def test_the_interval_of_a_run_alone_is_that_of_its_analysis(store: Store) -> None:
+    fill(store, TERRAINS, runs=1)
+    rows = ask(store).datasets
+    assert rows.height == 2 * len(TERRAINS)
+    for row in rows.iter_rows(named=True):
+        tables = [read_current(store, f"{row['terrain']}_0", name) for name in ("aggregates", "slip")]
+        told = summarize_inputs(*tables)[row["input"]]
+        assert row["interval"] == "this run only"
+        assert [round(row[key], 6) for key in ("low", "high")] == [
+            told["median_modulus_low"],
+            told["median_modulus_high"],
+        ]
 
 
 def test_the_figure_shows_whole_intervals_and_says_of_what_they_are(store: Store) -> None:
@@ -180,7 +195,7 @@ def test_the_same_question_gets_the_same_bytes(store: Store) -> None:
 
 
 def make_group(name: str, *medians: float) -> Group:
-    return Group.of_runs(name, [SlipSamples(np.full(40, one), 40.0) for one in medians])
+    return Group.of_runs(name, [SlipSamples(np.full(40, one), np.arange(40.0)) for one in medians])
 
 
 def test_a_ground_with_one_run_is_tested_by_the_spread_of_the_others() -> None:
@@ -201,7 +216,7 @@ def test_a_ground_with_one_run_is_tested_by_the_spread_of_the_others() -> None:
 def test_runs_alone_are_compared_by_their_parts_and_only_with_each_other() -> None:
     rng = np.random.default_rng(0)
     groups = [
-        Group.of_runs(name, [SlipSamples(rng.lognormal(level, 0.5, 4_000), 200.0)])
+        Group.of_runs(name, [SlipSamples(rng.lognormal(level, 0.5, 4_000), np.arange(0.0, 200.0, 0.05))])
         for name, level in (("a", 0.0), ("b", 1.0))
     ]
     (pair,) = compare_groups(groups)

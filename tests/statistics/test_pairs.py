@@ -11,7 +11,6 @@ from simulated_runs import RATE, simulate_runs
 from pipeline.datasets.pairs import (
     Group,
     SlipSamples,
-    bound_run,
     cliffs_delta,
     compare_groups,
     mann_whitney,
@@ -30,20 +29,25 @@ def test_the_shift_and_delta_are_those_of_all_pairs(a: np.ndarray, b: np.ndarray
     assert cliffs_delta(a, b) == pytest.approx((above - below) / len(pairs))
 
 
+def sample(values: np.ndarray, seconds: float) -> SlipSamples:
+    """Samples that are spread over a time."""
+    return SlipSamples(values, np.arange(values.size) * (seconds / values.size))
+
+
 def test_a_run_stands_as_parts_of_one_length_evenly_over_it() -> None:
     values = np.repeat(np.arange(1.0, 9.0), 50)
     eight = list(range(1, 9))
-    assert SlipSamples(values, 400.0).cut(50.0).tolist() == eight
-    assert SlipSamples(values, 400.0).cut(10.0).tolist() == eight, "eight at most, from all of the run"
-    assert SlipSamples(values, 40.0).cut(10.0).size == 4
-    assert SlipSamples(values, 9.0).cut(10.0).tolist() == [4.5]
-    assert bound_run(SlipSamples(values, 29.0)) is None, "two parts do not determine a spread"
+    assert sample(values, 400.0).cut(50.0).tolist() == eight
+    assert sample(values, 400.0).cut(10.0).tolist() == eight, "eight at most, from all of the run"
+    assert sample(values, 40.0).cut(10.0).size == 4
+    assert sample(values, 9.0).cut(10.0).tolist() == [4.5]
+    assert sample(values, 19.0).bound() is None, "two parts do not determine a spread"
 
 
 def single(name: str, seconds: float, median: float = 1.0) -> Group:
     rng = np.random.default_rng(round(seconds))
     values = rng.lognormal(math.log(median), 0.1, round(20 * seconds))
-    return Group.of_runs(name, [SlipSamples(values, seconds)])
+    return Group.of_runs(name, [sample(values, seconds)])
 
 
 @pytest.mark.parametrize("seconds", [1.0, 29.0])
@@ -68,7 +72,7 @@ def test_groups_that_do_not_scatter_are_not_tested() -> None:
 
 def compare_parts(*sides: np.ndarray) -> float:
     """p of two runs by their parts; 1 where they are not tested."""
-    runs = [[SlipSamples(side, side.size / RATE)] for side in sides]
+    runs = [[sample(side, side.size / RATE)] for side in sides]
     (pair,) = compare_groups([Group.of_runs(name, run) for name, run in zip("ab", runs, strict=True)])
     return 1.0 if pair["p"] is None else float(str(pair["p"]))
 

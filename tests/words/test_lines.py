@@ -1,16 +1,21 @@
 """Lines of a diagnosis: few by default, each idea once."""
 
+import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 
 from pipeline.core import format_length
+from pipeline.estimation.diagnosis import _parameter_rows
+from pipeline.estimation.driving_need import Curve, measure_need
 from pipeline.estimation.ladder import Ladder, LadderStep
-from pipeline.models import Number, name_term
+from pipeline.models import FEW_STRETCHES, Number, name_term
 from pipeline.recording import Finding
-from pipeline.results import DataNeed, Errors, Named, Region, RunDiagnosis, Unexplained
+from pipeline.results import DataNeed, Errors, Named, Region, RunDiagnosis, Unexplained, rank_main
+from pipeline.results.reading import rank_effects
 from pipeline.words.diagnosis import describe, describe_standing, format_short, list_findings, list_lines
 from pipeline.words.effects import describe_clause
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
@@ -36,11 +41,32 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
     assert [text.startswith(name_term(name)) for name, text in zip(MANY, shown[:5], strict=False)] == [
         True
     ] * 5
-    assert shown[5] == "2 smaller effects (--all)"
+    assert shown[5] == "2 more effects (--all)"
     assert shown[6:] == ["!  warning 0", "!  warning 1", "!  warning 2", "   2 more (--all)"]
     everything = describe([run], everything=True)
     assert all(name in everything for name in (*MANY, "warning 4"))
     assert "(--all)" not in everything
+
+
+def test_no_effect_is_hidden_that_removes_more_than_one_that_is_shown() -> None:
+    names = ("effective_track", "wheel_radius", "lateral_skid", "body_turn_limit", "deadband")
+    errors = [(1.0, 1.0), (0.5, 0.5), (0.46, 0.46), (0.2, 0.46), (0.2, 0.38), (0.19, 0.38)]
+    values = {"wheel_radius": {"k": 0.8}}
+    shares = {"effective_track": 0.4, "body_turn_limit": 0.3, "lateral_skid": 0.2, "deadband": 0.02}
+    budget = [
+        {"input": "command", "quantity": "slip", "total": 1.0,
+         "shares": [{"effect": name, "share": share} for name, share in shares.items()]},
+    ]  # fmt: skip
+    drawn = draw_diagnosis({name: values.get(name, {}) for name in names}, errors, budget=budget)
+    run = replace(drawn, run="field/run", input="command")
+    shown = [text for label, text in list_lines(run) if label != "verdict"]
+    assert [text.split("  ")[0] for text in shown[:4]] == [name_term(name) for name in names[:4]]
+    assert "listed for its large value" in shown[1]
+    assert shown[4] == "1 smaller effect (each below a tenth of every error; --all)"
+    assert {*rank_main(run)} == {name for name, share in rank_effects(run).items() if share >= 0.1}
+    # The verdict names the largest, in the order of the ladder.
+    texts = [describe_clause(one, run) for one in run.effects]
+    assert [text in list_lines(run)[0][1] for text in texts] == [True, False, True, True, False]
 
 
 def test_the_first_line_says_which_runs_are_simulated() -> None:
@@ -139,10 +165,33 @@ def test_a_region_of_two_errors_is_said_once() -> None:
             "4 of 16 parameters are known within 5 %; 7 more minutes of such driving for 5 % of all",
         ),
         (DataNeed(open=1), "the one parameter is not known within 5 %"),
+        (DataNeed(("a.k",), math.nan, 60.0), "a.k is known within 5 %"),
     ],
 )
 def test_how_much_is_known_is_one_sentence(need: DataNeed, said: str) -> None:
     assert describe_need(RunDiagnosis(need=need)) == said
+
+
+def test_what_is_in_doubt_is_not_known_and_why_is_said() -> None:
+    drawn = draw_diagnosis({"steering_lag": {"tau": 0.45}, "deadband": {"d": 0.2}}, [(1.0, 0.5)] * 3)
+    lag, deadband = drawn.effects
+    sure, open_ends = Number(0.45, 0.449, 0.451, "s"), Number(0.2, 0.195, 0.205, "m/s")
+    few = replace(sure, doubt=FEW_STRETCHES, stretches=4)
+    curve = {"steering_lag.tau": Curve(np.array([20.0, 60.0]), np.array([0.002, 0.001]))}
+    for tau, d, said in (
+        (few, open_ends, f"1 of 2 parameters is known within 5 %; steering_lag.tau: {few.reason}"),
+        (sure, open_ends, "2 of 2 parameters are known within 5 %"),
+        (sure, replace(open_ends, low=0.1, high=0.3), "1 of 2 parameters is known within 5 %"),
+    ):
+        effects = (replace(lag, parameters={"tau": tau}), replace(deadband, parameters={"d": d}))
+        need = measure_need(effects, curve)
+        assert describe_need(replace(drawn, effects=effects, need=need)) == said
+        rows = {row["parameter"]: row["doubt"] for row in _parameter_rows(replace(drawn, effects=effects))}
+        assert rows == {"tau": tau.doubt, "d": ""}
+    alone = replace(drawn, effects=(replace(lag, parameters={"tau": sure}),))
+    assert describe_need(replace(alone, need=measure_need(alone.effects, curve))) == (
+        "steering_lag.tau is known within 5 %, after 20 s of 60 s"
+    )
 
 
 def test_motion_that_lasts_is_one_short_sentence() -> None:

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, Number, find_effect, list_effects
+from pipeline.export import export_model, list_omitted
+from pipeline.models import FEW_STRETCHES, Model, ModelFile, Number, find_effect, list_effects
 from pipeline.results import Errors, Named, Refused, RunDiagnosis, Unexplained, read_result
 from pipeline.results.reading import split_main
 from pipeline.sources import list_presets
@@ -37,8 +37,8 @@ def test_what_people_act_on_is_no_smaller_effect() -> None:
     flat, round_ = (Named("wheel_radius", {"k": Number(k, k - 0.01, k + 0.01)}) for k in (0.85, 0.98))
     vague = Named("transport_delay", {"d": Number(0.4, 0.01, 0.8, "s")})
     effects = [lag, band, clock, late, flat, round_, vague]
-    assert split_main(effects, drawn.ladder) == ([lag, clock, late, flat], [band, round_, vague])
-    assert split_main([band, clock], drawn.ladder) == ([band, clock], [])
+    assert split_main(effects, drawn) == ([lag, clock, late, flat], [band, round_, vague])
+    assert split_main([band, clock], drawn) == ([band, clock], [])
 
 
 def test_every_effect_reads_well_in_a_verdict() -> None:
@@ -99,8 +99,23 @@ def test_what_differs_between_grounds_is_a_range_in_the_verdict() -> None:
 
 def test_the_export_that_is_suggested_takes_the_vehicle() -> None:
     for vehicle in _PRESETS.values():
-        *_, target = suggest_export(vehicle.kind, "robot.toml").split()
-        assert export_model(ModelFile(Model(vehicle, ())), target)
+        file = ModelFile(Model(vehicle, ()))
+        *_, target = suggest_export(file, "robot.toml").split()
+        assert export_model(file, target)
+
+
+def test_the_export_that_is_suggested_leaves_not_all_out() -> None:
+    effects = (find_effect("drive_lag")().change(tau=0.3), find_effect("effective_track")().change(k=1.6))
+    known = Number(1.6, 1.55, 1.65)
+    doubtful = replace(known, doubt=FEW_STRETCHES, stretches=3)
+    lag = replace(doubtful, value=0.3, low=0.29, high=0.31, unit="s")
+    for count, number, expected in ((1, lag, "python"), (2, known, "ros2_control"), (2, doubtful, "python")):
+        numbers = {"drive_lag.tau": lag, "effective_track.k": number}
+        fit = {"runs": [{"run": "field/a"}]}
+        file = ModelFile(Model(_PRESETS["husky_a200"], effects[:count]), numbers=numbers, fit=fit)
+        *_, target = suggest_export(file, "robot.toml").split()
+        assert target == expected
+        assert len(list_omitted(file, target)) < count
 
 
 def test_a_verdict_is_never_too_long() -> None:
