@@ -316,8 +316,7 @@ def measure_motion(poses: pl.DataFrame, *, is_level: bool = False) -> Motion:
     position = fresh.select("x", "y", "z").to_numpy()
     quaternion = fresh.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     period = float(np.median(np.diff(time)))
-    # A short record has enough steps where they are shorter: their noise is fitted, whatever their length.
-    length = max(period, min(STEP_S, (time[-1] - time[0]) / _ENOUGH_STEPS))
+    length = find_step(time[-1] - time[0], period)
     rows = _choose_rows(time, 0.95 * length)
     if len(rows) <= FEWEST_STEPS:
         return NO_MOTION
@@ -344,6 +343,18 @@ def measure_motion(poses: pl.DataFrame, *, is_level: bool = False) -> Motion:
         turned[sane],
         up,
     )
+
+
+def find_step(lasted: float, period: float = 0.0) -> float:
+    """Length of the steps [s] of a record: of a short one they are shorter, so that they are enough.
+
+    Their noise is fitted, whatever their length.
+
+    Args:
+        lasted: from its first to its last message [s].
+        period: of its messages [s], below which no step says more; zero of what holds in between.
+    """
+    return max(period, min(STEP_S, lasted / _ENOUGH_STEPS))
 
 
 def _choose_rows(time: Floats, length: float) -> list[int]:

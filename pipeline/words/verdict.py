@@ -29,6 +29,7 @@ from pipeline.words.findings import format_finding
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
 _NOTHING_EVIDENT = "No effect is evident"
+_ASSUMED = "its speeds are by an assumed gain of {used:g}, where this log says {value:.4g}"
 NO_GROUND = "the log holds no pose: slip is that of the wheels against their commands, not that of the ground"
 _UNKNOWN = "no known effect explains the rest"
 _MOST_CLAUSES = 3
@@ -59,6 +60,7 @@ def format_verdict(run: RunDiagnosis) -> str:
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
     opening = f"Over {HORIZON_S:g} s the ideal model is {format_step(ladder[0])} off"
     scope = [NO_GROUND] if has_no_pose(run.findings) else []
+    scope += [_ASSUMED.format(**one.values) for one in run.findings if one.id == "gain_assumed"]
     is_sized = not math.isnan(ladder[0].t_mrmse_m)
     if not is_sized:
         opening = "No stretch of good poses is long enough to tell an error"
