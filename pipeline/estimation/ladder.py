@@ -23,6 +23,7 @@ from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
 from pipeline.models import Model, ModelFile, Number, Timing
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, Step, as_written, list_rises, to_json
 from pipeline.run import STILL_MPS
+from pipeline.sources import RANGES
 
 _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
@@ -315,6 +316,11 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     ]
     if own:
         fit["own"] = own
+    # A dimension that one run only contradicts may be right, and the ground of that run slippery.
+    contradicted = frozenset.intersection(*(one.run.contradicted for one in data.residuals_by_run))
+    dimensions = pick(model.vehicle, *sorted(contradicted & {*RANGES}))
+    if dimensions:
+        fit["contradicted"] = dimensions
     per_run = tuple(dict.fromkeys((*file.per_run, *assessment.fitted.per_run)))
     # Other runs may distinguish effects that those of the diagnosis could not.
     names = [run["run"] for run in file.list_fitted("runs")]

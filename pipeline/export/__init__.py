@@ -30,6 +30,7 @@ from pipeline.core import (
     suffix_unit,
 )
 from pipeline.models import (
+    CONTRADICTED,
     LEAST_DELAY_S,
     UNDECIDED,
     Effect,
@@ -501,8 +502,10 @@ class Facts:
         """Return a vehicle dimension by its field name; unknown if it is not given (NaN) or a stand-in."""
         value = getattr(self.vehicle, name)
         known = name not in self.vehicle.stand_ins
-        sources = (f"vehicle {name_entity(self.vehicle)}: {name}",) if known else ()
-        return Amount(math.nan if value is None else value, sources)
+        is_doubtful = name in self.file.contradicted
+        about = f", {CONTRADICTED}" if is_doubtful else ""
+        sources = (f"vehicle {name_entity(self.vehicle)}: {name}{about}",) if known else ()
+        return Amount(math.nan if value is None else value, sources, is_doubtful=is_doubtful)
 
     def find(self, name: str | Quantity) -> Amount:
         """Return a quantity, a dimension of the vehicle, or what a method `find_` of that name finds.

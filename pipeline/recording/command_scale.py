@@ -114,7 +114,7 @@ def measure_command_scale(
 
 def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
     """Wheels that turn at another speed than commanded where the body does as it is told."""
-    values = {"value": forward, "radius_m": vehicle.wheel_radius_m}
+    values = {"value": forward, "radius_m": vehicle.wheel_radius_m, "dimensions": ["wheel_radius_m"]}
     return Finding("wheels_scaled", "warning", "wheels", values)
 
 

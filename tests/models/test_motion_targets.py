@@ -16,8 +16,9 @@ from pipeline import export
 from pipeline.core import PACKAGE, read_version
 from pipeline.export import Facts, export_model, list_targets
 from pipeline.export.spread import find_response
-from pipeline.models import find_effect, format_model, list_effects, predict_step
+from pipeline.models import find_effect, format_model, list_effects, predict_step, read_model
 from pipeline.run import MotionError
+from pipeline.simulate import make_scenario, simulate_run, write_log
 from pipeline.sources import Vehicle, list_presets
 
 PARAMETERS = sorted(SCHEMAS)
@@ -269,6 +270,26 @@ def test_a_length_alone_makes_no_deadband() -> None:
     _, _, unknown = text.partition("Not written, as no effect of the model determines it:")
     assert "VelocityDeadbandCritic.deadband_velocities" in unknown
     assert "deadband_velocities:" not in text
+
+
+def test_a_dimension_that_the_runs_contradict_is_a_comment_until_it_is_changed() -> None:
+    """A radius that was twice the true one was told of, and went into the controller without a word."""
+    file = make(fit={**FIT, "contradicted": {"wheel_radius_m": HUSKY.wheel_radius_m}})
+    said = "in doubt: findings of the runs of the fit contradict it"
+    assert f"# wheel_radius_m is {said}" in format_model(file)
+    text = export_model(file, "ros2_control")
+    assert f"# vehicle husky_a200: wheel_radius_m, {said}\n    # wheel_radius: 0.165" in text
+    assert "\n    wheel_separation: 0.55" in text
+    other = make(vehicle=msgspec.structs.replace(HUSKY, wheel_radius_m=0.17), fit=file.fit)
+    assert "\n    wheel_radius: 0.17" in export_model(other, "ros2_control")
+
+
+def test_a_fit_notes_the_dimensions_that_its_run_contradicts(tmp_path: Path) -> None:
+    log, model = tmp_path / "log.mcap", tmp_path / "m.toml"
+    write_log(simulate_run(make_scenario("husky_tile", seed=3, duration_s=100.0)), log)
+    (tmp_path / "run.toml").write_text('[vehicle]\npreset = "husky_a200"\nwheel_radius_m = 0.33\n')
+    run_verb("diagnose", log, "--apply", model, "--results", tmp_path / "results")
+    assert read_model(model).contradicted == ["wheel_radius_m"]
 
 
 @pytest.mark.parametrize(("turned", "drove"), [(0.108, 1.97), (0.9, 0.05)])
