@@ -42,6 +42,7 @@ from pipeline.results import (
 from pipeline.run import HORIZON_S
 from pipeline.words.effects import (
     describe_cause,
+    describe_instead,
     describe_motion,
     describe_number,
     describe_separation,
@@ -107,7 +108,7 @@ _FINDINGS_SHOWN = 3
 _HEADS_SHOWN = 4
 """Most runs that are named one a line by default; the names of more are between the first and the last."""
 _EFFECTS_SHOWN = 5
-"""Effects with a line by default."""
+"""Effects with a line by default, beside those that stand out."""
 
 
 def has_dead_encoder(findings: Iterable[Finding]) -> bool:
@@ -209,10 +210,15 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     named = [one for one in main if one.id not in undecided]
     shown = [one for one in named if falls.get(one.id) != _UNCHANGED or one.stands_out]
     unseen = [one for one in named if one not in shown]
-    folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor)
+    kept = [one for number, one in enumerate(shown) if number < _EFFECTS_SHOWN or one.stands_out]
+    folded = len(shown) - len(kept) + len(unseen) + len(minor)
     rows = [
-        (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
-        for effect in shown[:_EFFECTS_SHOWN]
+        (
+            name_term(effect.id),
+            falls.get(effect.id, ""),
+            ", ".join(filter(None, (f"{effect.id}: {format_short(effect)}", describe_instead(effect, run)))),
+        )
+        for effect in kept
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     texts = [
