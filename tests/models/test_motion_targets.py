@@ -14,7 +14,7 @@ from verbs import run_verb
 
 from pipeline import export
 from pipeline.core import PACKAGE, read_version
-from pipeline.export import Facts, export_model, list_targets
+from pipeline.export import REACHED_ACCELERATION, Facts, export_model, list_targets
 from pipeline.export.spread import find_response
 from pipeline.models import find_effect, format_model, list_effects, predict_step, read_model
 from pipeline.run import MotionError
@@ -289,7 +289,22 @@ def test_a_fit_notes_the_dimensions_that_its_run_contradicts(tmp_path: Path) -> 
     write_log(simulate_run(make_scenario("husky_tile", seed=3, duration_s=100.0)), log)
     (tmp_path / "run.toml").write_text('[vehicle]\npreset = "husky_a200"\nwheel_radius_m = 0.33\n')
     run_verb("diagnose", log, "--apply", model, "--results", tmp_path / "results")
-    assert read_model(model).contradicted == ["wheel_radius_m"]
+    file = read_model(model)
+    assert file.contradicted == ["wheel_radius_m"]
+    (run,) = file.list_fitted("runs")
+    assert 0.5 < run[REACHED_ACCELERATION] < 20.0  # type: ignore[operator]
+
+
+def test_an_acceleration_is_exported_as_the_robot_reaches_it() -> None:
+    """A limit of commands, which slow motors follow late, was higher than any acceleration of the drive."""
+    (run,) = FIT["runs"]  # type: ignore[misc]
+    slow = {**FIT, "runs": [{**run, REACHED_ACCELERATION: 3.1}]}  # type: ignore[misc]
+    limit = find_effect("body_acceleration_limit")(limit=5.35)
+    known = {"body_acceleration_limit.limit": (5.1, 5.6)}
+    text = export_model(make(limit, fit=slow, intervals=known), "ros2_control")
+    assert "no more than was driven: 3.1 m/s^2" in text
+    assert "max_acceleration: 3.1\n" in text
+    assert "max_acceleration: 5.35\n" in export_model(make(limit, fit=FIT, intervals=known), "ros2_control")
 
 
 @pytest.mark.parametrize(("turned", "drove"), [(0.108, 1.97), (0.9, 0.05)])
