@@ -552,8 +552,9 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "imu_unchecked": "the vehicle turned too little to check the gyro against the poses: it was not used",
     "imu_disagrees": "the gyro does not agree with the poses, or is silent in part of the run: it was not "
     "used",
-    "imu_sign": "the gyro's yaw rate has the wrong sign and was inverted: it then differs from the yaw rate "
-    "of the poses by {residual:share}",
+    "imu_sign": "the gyro's yaw rate has the wrong sign and was inverted, as sign = -1 under [imu] in "
+    "run.toml does; sign = 1 takes it as recorded: inverted, it differs from the yaw rate of the poses by "
+    "{residual:share}",
     "imu_scale": "the poses turn {value:.3f} times as much as the gyro says: it was scaled",
     "imu_bias": "the gyro has a bias of {value:.4f} rad/s against the poses: it was removed",
     "imu_gap": "the gyro is silent in {count} time steps: the poses' yaw rate is used there",
