@@ -237,16 +237,22 @@ def _list_main(run: RunDiagnosis) -> list[str]:
 
 
 def _list_raising(run: RunDiagnosis) -> list[str]:
-    """The named effects that raise an error over 2 s and lower none."""
+    """The named effects that raise one error over 2 s by more than they lower the other."""
     named = {effect.id for effect in run.effects}
     return [
         f"{name_term(name)} {describe_rises(before, after)}: it is named because the motion over "
         "shorter times is more likely with it"
         for before, after in pairwise(run.ladder)
-        if list_rises(before, after, CHANCE) and not list_rises(after, before, CHANCE)
+        if list_rises(before, after, CHANCE) and _measure_change(before, after) > 0.0
         for name in list_added(before, after)
         if name in named
     ]
+
+
+def _measure_change(before: Step, after: Step) -> float:
+    """Logarithm of the product of the errors over 2 s after a step over that before it."""
+    pairs = ((getattr(before, key), getattr(after, key)) for key in ERRORS_OVER_2S)
+    return sum(math.log(new / old) for old, new in pairs if old > 0.0 < new)
 
 
 def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:

@@ -228,3 +228,9 @@ def test_an_effect_that_only_raises_errors_is_said_to_do_so() -> None:
     assert not [text for _, text in list_lines(better) if "raises" in text]
     everything = " ".join(text for _, text in list_lines(better, everything=True))
     assert "35 -> 30 cm; raises the heading error from 11 to 12 degrees" in everything
+    # Twice the position error for a twentieth of the heading error stood behind `--all`.
+    worse = replace(
+        drawn, ladder=(*drawn.ladder[:3], replace(drawn.ladder[3], t_mrmse_m=0.7, r_mrmse_rad=0.19))
+    )
+    (line,) = [text for _, text in list_lines(worse) if "raises" in text]
+    assert line.startswith("turning lag raises the position error from 35 to 70 cm: it is named")
