@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 
 from pipeline.core import enumerate_texts, format_share
-from pipeline.models import name_term
+from pipeline.models import FEW_STRETCHES, name_term
 from pipeline.recording import Finding
 from pipeline.results import (
     ABOVE_FLOOR,
@@ -13,6 +13,7 @@ from pipeline.results import (
     CHANGE,
     ERRORS_OVER_2S,
     SEARCH_CUT,
+    Named,
     RunDiagnosis,
     Step,
     find_refusal,
@@ -31,6 +32,7 @@ NOTHING_MISSING = "No effect is missing"
 _NOTHING_EVIDENT = "No effect is evident"
 _ASSUMED = "its speeds are by an assumed gain of {used:g}, where this log says {value:.4g}"
 NO_GROUND = "the log holds no pose: slip is that of the wheels against their commands, not that of the ground"
+_TENTATIVE = " (tentative)"
 _UNKNOWN = "no known effect explains the rest"
 _MOST_CLAUSES = 3
 """Effects that a verdict names; others are in the table below it."""
@@ -150,7 +152,13 @@ def _list_clauses(run: RunDiagnosis) -> list[str]:
     undecided = {one.in_model for one in run.undecided}
     named = {one.id: one for one in run.effects if one.is_determined}
     chosen = [named[name] for name in rank_main(run.ladder) if name in named and name not in undecided]
-    return [clause for one in chosen if (clause := describe_clause(one, run))]
+    clauses = ((one, describe_clause(one, run)) for one in chosen)
+    return [f"{clause}{_TENTATIVE * _is_tentative(one)}" for one, clause in clauses if clause]
+
+
+def _is_tentative(effect: Named) -> bool:
+    """Whether few stretches of the drive tell one of its numbers."""
+    return any(value.doubt == FEW_STRETCHES for value in effect.parameters.values())
 
 
 def _describe_choice(run: RunDiagnosis) -> str:
