@@ -31,7 +31,7 @@ def ask_gains(case: Case) -> Case:
             continue
         per = case.vehicle.units[unit].per
         values = {
-            "kind": "odometry" if source else "poses",
+            "by": "odometry" if source else "poses",
             "unit": unit,
             "used": per,
             "value": per / ratio,

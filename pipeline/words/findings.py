@@ -369,7 +369,7 @@ def _wheel_radius_wrong(of: Values) -> str:
 def _gain_assumed(of: Values) -> str:
     lines = " and ".join(f"[{one}]" for one in of["sections"])
     ratio = of["scale"]
-    is_computed = of["kind"] == "odometry"
+    is_computed = of["by"] == "odometry"
     source = f"{of['source']} of this log" if is_computed else f"the way of {of['source']}"
     return (
         f"a gain of {of['used']:g} {of['unit']} per m/s is assumed, that of the preset; {source} says "
