@@ -37,7 +37,7 @@ _LEAST_ROOM = 0.02
 _DRIVEN_QUANTILE = 0.99
 """Quantile of the driven speed: the maximum would be that of one bad pose."""
 _REACHED_S = 0.1
-"""Time over which an acceleration is reached [s]: no controller of a robot is told by shorter ones."""
+"""Time over which an acceleration is measured [s], two or three cycles of a controller."""
 _LEAST_SQUARE = 1e-24
 """Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
 

@@ -210,15 +210,15 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     named = [one for one in main if one.id not in undecided]
     shown = [one for one in named if falls.get(one.id) != _UNCHANGED or one.stands_out]
     unseen = [one for one in named if one not in shown]
-    kept = [one for number, one in enumerate(shown) if number < _EFFECTS_SHOWN or one.stands_out]
-    folded = len(shown) - len(kept) + len(unseen) + len(minor)
+    listed = [one for number, one in enumerate(shown) if number < _EFFECTS_SHOWN or one.stands_out]
+    folded = len(shown) - len(listed) + len(unseen) + len(minor)
     rows = [
         (
             name_term(effect.id),
             falls.get(effect.id, ""),
             ", ".join(filter(None, (f"{effect.id}: {format_short(effect)}", describe_instead(effect, run)))),
         )
-        for effect in kept
+        for effect in listed
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     texts = [
