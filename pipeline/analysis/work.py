@@ -236,6 +236,7 @@ class Work:
             body_commanded=self.setup.is_body_commanded,
             where=str(self.setup.path),
             is_drive_alone=self.setup.is_drive_alone,
+            has_gyro_sign=self.setup.configuration.imu.sign is not None,
         )
         for name, checked in extracted.items():
             aligned = self._identify(name, made.tables.get(name, checked.valid))

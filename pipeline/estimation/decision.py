@@ -673,7 +673,7 @@ def judge(
         refusal = "the error on data that it was not fitted to does not fall"
     else:
         is_proven = True
-        if felt < SHOWN and not _outdoes_another(fit, effect, matrix):
+        if felt < SHOWN and not _outdoes_another(fit, effect):
             refusal = (
                 f"no error against {path.target} falls by more than {format_share(felt)}, "
                 f"required {format_share(SHOWN)}"
@@ -683,21 +683,24 @@ def judge(
     return Judged(base, fit, effect.id, refusal, is_proven, t, frequency, gain, evidence)
 
 
-def _outdoes_another(fit: PathFit, effect: Effect, matrix: Matrix) -> bool:
+def _outdoes_another(fit: PathFit, effect: Effect) -> bool:
     """Whether a model of as many effects would be better with an effect, felt there, in the place of another.
 
     What two effects do alike, each does little of beside the other: the better one would go without a name.
     """
-    own, path = matrix.expect_change(Move().drop(effect.id)), fit.path
+
+    def leave_out(*names: str) -> PathFit:
+        return _fit_under(fit.path, fit.state.drop(names), fit.noise, _STEPS)
+
+    least = find_cost(leave_out(effect.id)) - EQUAL
     for other in fit.ids:
-        if other == effect.id or not matrix.expect_change(Move().drop(other)) < own - EQUAL:
+        if other == effect.id:
             continue
-        (there,), (neither,) = (
-            matrix.list_states(Move().drop(*gone)) for gone in ((other,), (other, effect.id))
-        )
-        alone = replace(fit, state=there, residual=path.find_residuals(there))
-        if find_expected_fall(alone, path.find_residuals(neither) - alone.residual) >= SHOWN:
-            return True
+        there = leave_out(other)
+        if find_cost(there) < least:
+            moved = leave_out(other, effect.id).residual - there.residual
+            if find_expected_fall(there, moved) >= SHOWN:
+                return True
     return False
 
 

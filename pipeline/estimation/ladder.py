@@ -18,16 +18,26 @@ from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.held_out import HeldOut, hold_out
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
+from pipeline.estimation.run_residuals import RunResiduals
 from pipeline.estimation.window_residuals import average_windows, locate_windows
-from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
+from pipeline.export import (
+    DRIVEN_SPEED,
+    DRIVEN_TURN,
+    LOWER_SPEED,
+    REACHED_ACCELERATION,
+    REACHED_TURN_ACCELERATION,
+)
 from pipeline.models import Model, ModelFile, Number, Timing
 from pipeline.results import CHANCE, ERRORS_OVER_2S, Errors, Step, as_written, list_rises, to_json
 from pipeline.run import STILL_MPS
+from pipeline.sources import RANGES
 
 _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
 _DRIVEN_QUANTILE = 0.99
 """Quantile of the driven speed: the maximum would be that of one bad pose."""
+_REACHED_S = 0.1
+"""Time over which an acceleration is measured [s], two or three cycles of a controller."""
 
 
 @dataclass(frozen=True)
@@ -271,6 +281,7 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
                 "pose_delay_s": run_residuals.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
                 **driven,
+                **_measure_reached(run_residuals, fitted, timing),
             }
             for run_residuals, timing, driven in zip(
                 data.residuals_by_run, assessment.fitted.state.timing, measure_driven(data), strict=True
@@ -298,6 +309,11 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
     ]
     if own:
         fit["own"] = own
+    # A dimension that one run only contradicts may be right, and the ground of that run slippery.
+    contradicted = frozenset.intersection(*(one.run.contradicted for one in data.residuals_by_run))
+    dimensions = pick(model.vehicle, *sorted(contradicted & {*RANGES}))
+    if dimensions:
+        fit["contradicted"] = dimensions
     per_run = tuple(dict.fromkeys((*file.per_run, *assessment.fitted.per_run)))
     # Other runs may distinguish effects that those of the diagnosis could not.
     names = [run["run"] for run in file.list_fitted("runs")]
@@ -306,6 +322,22 @@ def note_fit(file: ModelFile, assessment: ModelAssessment) -> ModelFile:
         undecided = [group for group in file.undecided if ids.intersection(group)]
         fit |= {key: rows for key, rows in (("undecided", undecided),) if rows}
     return replace(file, model=model, per_run=per_run, numbers=others | assessment.numbers, fit=fit)
+
+
+def _measure_reached(run_residuals: RunResiduals, model: Model, timing: Timing) -> dict[str, float]:
+    """Largest forward and yaw acceleration of a model over a tenth of a second of a run.
+
+    The motion of poses is too noisy for them.
+    """
+    velocity = run_residuals.predict_velocity(run_residuals.list_active(model), timing)
+    step = run_residuals.grid.step_s
+    count = max(1, round(_REACHED_S / step))
+    signals = {REACHED_ACCELERATION: velocity.x, REACHED_TURN_ACCELERATION: velocity.w}
+    return {
+        key: round(float(np.abs(one[count:] - one[:-count]).max()) / (count * step), 4)
+        for key, one in signals.items()
+        if one.size > count
+    }
 
 
 def measure_driven(data: EstimationData) -> list[dict[str, float]]:

@@ -126,7 +126,7 @@ STAGE = "diagnosis"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
-VERSION = 61
+VERSION = 62
 
 
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")

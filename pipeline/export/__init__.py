@@ -30,6 +30,7 @@ from pipeline.core import (
     suffix_unit,
 )
 from pipeline.models import (
+    CONTRADICTED,
     LEAST_DELAY_S,
     UNDECIDED,
     Effect,
@@ -254,6 +255,10 @@ LARGEST = 1e9
 large."""
 DRIVEN_SPEED, DRIVEN_TURN = "driven_speed_mps", "driven_yaw_rate_radps"
 """Keys of the largest driven values in the runs of a fit."""
+REACHED_ACCELERATION = "reached_acceleration_mps2"
+REACHED_TURN_ACCELERATION = "reached_yaw_acceleration_radps2"
+"""Keys of the largest accelerations that the model reaches in the runs of its fit."""
+_DRIVEN_KEYS = (DRIVEN_SPEED, DRIVEN_TURN, REACHED_ACCELERATION, REACHED_TURN_ACCELERATION)
 LOWER_SPEED = "lower_speed_mps"
 """Key of the speed below which a quarter of the driving was slower, in the runs of a fit."""
 
@@ -318,7 +323,7 @@ def _check_numbers(file: ModelFile, current: Current) -> None:
             if math.isfinite(value) or math.isfinite(parameter.neutral):
                 require_plausible(f"{effect.id}.{parameter.name}", value)
     for row in file.list_fitted("runs"):
-        for key in (DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED):
+        for key in (*_DRIVEN_KEYS, LOWER_SPEED):
             if isinstance(driven := row.get(key), float):
                 require_plausible(f"fit.runs.{key}", driven, least=0.0)
     for name, value in current.items():
@@ -498,8 +503,10 @@ class Facts:
         """Return a vehicle dimension by its field name; unknown if it is not given (NaN) or a stand-in."""
         value = getattr(self.vehicle, name)
         known = name not in self.vehicle.stand_ins
-        sources = (f"vehicle {name_entity(self.vehicle)}: {name}",) if known else ()
-        return Amount(math.nan if value is None else value, sources)
+        is_doubtful = name in self.file.contradicted
+        about = f", {CONTRADICTED}" if is_doubtful else ""
+        sources = (f"vehicle {name_entity(self.vehicle)}: {name}{about}",) if known else ()
+        return Amount(math.nan if value is None else value, sources, is_doubtful=is_doubtful)
 
     def find(self, name: str | Quantity) -> Amount:
         """Return a quantity, a dimension of the vehicle, or what a method `find_` of that name finds.
@@ -654,24 +661,28 @@ class Facts:
         return self._hold(_take_least(commanded, wheels), DRIVEN_TURN, "rad/s")
 
     def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
-        """Limit of the body, at most the largest driven value: wheels that turn faster may slip."""
+        """Limit of the body, at most the largest driven value: wheels that turn faster may slip.
+
+        A limit of commands that motors follow late is higher than what the body reaches.
+        """
         most = max(self.list_driven(key), default=math.inf)
         if not limit.is_known or limit.value <= most:
             return limit
-        source = f"no more than was driven: {most:.3g} {unit} (99th percentile)"
+        source = f"no more than was driven: {most:.3g} {unit}"
         return replace(limit, value=most, sources=(*limit.sources, source))
 
     def find_speed_acceleration(self) -> Amount:
         """Largest acceleration [m/s^2], from the command or from the wheels driving straight."""
         wheels = self.take(Quantity.WHEEL_ACCELERATION_LIMIT).change(operator.mul, self.find_radius())
         commanded = self.take(Quantity.ACCELERATION_LIMIT).change(operator.mul, self.take(Quantity.RADIUS))
-        return _take_least(commanded, wheels)
+        return self._hold(_take_least(commanded, wheels), REACHED_ACCELERATION, "m/s^2")
 
     def find_turn_acceleration(self) -> Amount:
         """Largest yaw acceleration [rad/s^2], from the command or turning on the spot; unknown for a car."""
         gains = self.take(Quantity.RADIUS), self.take(Quantity.TRACK)
         commanded = self.take(Quantity.TURN_ACCELERATION_LIMIT).change(lambda a, r, k: a * r / k, *gains)
-        return _take_least(commanded, self._spin(Quantity.WHEEL_ACCELERATION_LIMIT))
+        limit = _take_least(commanded, self._spin(Quantity.WHEEL_ACCELERATION_LIMIT))
+        return self._hold(limit, REACHED_TURN_ACCELERATION, "rad/s^2")
 
     def find_deadband_speed(self) -> Amount:
         """Deadband as speed when driving straight [m/s]."""

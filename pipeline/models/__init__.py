@@ -77,6 +77,7 @@ else:
                 "replace_context",
             ),
             "model_file": (
+                "CONTRADICTED",
                 "ModelFile",
                 "parse_model",
                 "read_model",

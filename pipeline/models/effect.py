@@ -251,6 +251,10 @@ class Effect(ABC):
         does = said.describe_clause() if said.words.motion else ""
         return does or f"shows signs of {self.id.replace('_', ' ')}"
 
+    def describe_instead(self, vehicle: Vehicle) -> str:
+        """What would show the same if one of `equivalent_to` acted in its place; empty without words."""
+        return self._make_sentences(vehicle, (), None).describe_instead()
+
     def _make_sentences(self, vehicle: Vehicle, beside: Iterable[Effect], asked: Asked | None) -> Sentences:
         beside = tuple(beside)
         others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}

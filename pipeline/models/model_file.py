@@ -6,7 +6,9 @@ import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
+import msgspec
 from msgspec.structs import replace
 
 from pipeline.core import (
@@ -16,6 +18,7 @@ from pipeline.core import (
     number_in,
     parse_toml,
     read_bounded_text,
+    round_digits,
     shorten,
 )
 from pipeline.models.catalogue import find_effect, refuse_taken
@@ -44,6 +47,8 @@ _ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
 Table = dict[str, object]
 
+CONTRADICTED: Final = "in doubt: findings of the runs of the fit contradict it"
+"""What is said of a dimension of the vehicle that is not to be used as it stands."""
 _UNKNOWN = Number(math.nan)
 
 
@@ -84,6 +89,14 @@ class ModelFile:
         groups = self.fit.get("undecided")
         lists = [group for group in groups if isinstance(group, list)] if isinstance(groups, list) else []
         return [[str(name) for name in group] for group in lists]
+
+    @property
+    def contradicted(self) -> list[str]:
+        """Dimensions of the vehicle that findings of the fitted runs contradict, and nobody changed since."""
+        rows = self.fit.get("contradicted")
+        values = rows if isinstance(rows, dict) else {}
+        now = msgspec.structs.asdict(self.model.vehicle)
+        return [name for name, one in values.items() if now.get(name) and round_digits(now[name]) == one]
 
     def list_rivals(self, effect: str) -> list[str]:
         """Ids of effects that explained the fitted runs as well as an effect of the model."""

@@ -14,7 +14,7 @@ from pipeline.models.effect import (
     Parameter,
 )
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.model_file import FORMAT, ModelFile
+from pipeline.models.model_file import CONTRADICTED, FORMAT, ModelFile
 from pipeline.models.number import Number
 from pipeline.run import MotionError
 from pipeline.sources import FLEET_FILE, RANGES, RUN_FILE, Vehicle, find_preset, is_model
@@ -67,6 +67,7 @@ def format_model(file: ModelFile) -> str:
     if file.note:
         lines.append(f"note = {format_value(file.note)}")
     lines += ["", *_format_vehicle(file.model.vehicle)]
+    lines += [f"# {name} is {CONTRADICTED}" for name in file.contradicted]
     for effect in file.model:
         lines += ["", *_list_lines(effect, file)]
     if file.fit:

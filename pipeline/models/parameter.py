@@ -323,6 +323,7 @@ class Parameter:
         quantities: quantities of controllers that it determines; empty where there are none.
         between_runs: variation from run to run; None where it was not measured.
         level: what it is a property of by its nature, as a controller's gain of the vehicle; None if open.
+        of_sides: whether it is a difference of left and right, of which a vehicle is built to have none.
     """
 
     name: str
@@ -343,6 +344,7 @@ class Parameter:
     quantities: tuple[Quantity, ...] = ()
     between_runs: Spread | None = None
     level: Level | None = None
+    of_sides: bool = False
 
     def __post_init__(self) -> None:
         if self.starts and self.search is Search.DIRECT:
@@ -392,7 +394,12 @@ class Parameter:
         return high - low >= max(abs(value - neutral), abs(self.typical - neutral))
 
     def is_large(self, value: float) -> bool:
-        """Whether a value is as far from neutral as a typical one; of a limit, none is."""
+        """Whether a value is as far from neutral as a typical one; of a limit, none is.
+
+        A difference of the sides is large beyond the tolerance of data sheets.
+        """
+        if self.of_sides and self.least is not None:
+            return abs(value - self.neutral) >= self.least.size
         return abs(value - self.neutral) >= abs(self.typical - self.neutral) < math.inf
 
     def is_one_sided(self, low: float, high: float) -> bool:

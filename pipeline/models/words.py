@@ -55,12 +55,15 @@ class Words(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         motion: name, colon, and what the vehicle does.
         clause: what it does as a predicate of "the robot", or as a clause that begins with "the"; where it is
             empty, the part of `motion` after the colon serves.
+        instead: what would show the same where an effect acts in its place that nothing distinguishes from
+            it; where it is empty, the names of these effects serve.
         beside: other effects of one factor that change the same motion, and what they are called: `others` is
             the product of their factors, and ``{with}`` names those that act.
     """
 
     motion: tuple[str, ...] = ()
     clause: tuple[str, ...] = ()
+    instead: tuple[str, ...] = ()
     beside: Mapping[str, str] = {}
 
     @property
@@ -114,6 +117,10 @@ class Sentences:
             return self._fill(self.words.clause)
         does = self.describe_motion().partition(": ")[2].removeprefix("the robot ")
         return does.replace("base_link", "the reference point")
+
+    def describe_instead(self) -> str:
+        """What would show the same in its place; empty where it has no words for that."""
+        return self._fill(self.words.instead) if self.words.instead else ""
 
     def _fill(self, templates: tuple[str, ...]) -> str:
         acting = {name: self.beside[name] for name in self.words.beside if name in self.beside}

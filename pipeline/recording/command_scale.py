@@ -117,7 +117,7 @@ def _report_wheels(forward: float, turning: float | None, vehicle: Vehicle) -> F
 
     Where their difference is in a smaller ratio, which no controller makes, the vehicle is another one.
     """
-    values = {"value": forward, "radius_m": vehicle.wheel_radius_m}
+    values = {"value": forward, "radius_m": vehicle.wheel_radius_m, "dimensions": ["wheel_radius_m"]}
     if turning is not None and vehicle.track_width_m and 0.0 < turning < forward * np.exp(-_SCALED):
         values["track_m"] = vehicle.track_width_m
         values["other_track_m"] = vehicle.track_width_m * turning / forward

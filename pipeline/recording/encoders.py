@@ -18,7 +18,7 @@ from pipeline.sources import DriveForm, DriveSection
 
 _FOLLOWS = 0.5
 """Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""
-_SAME = 1.25
+SAME_SCALE = 1.25
 """Ratio of two wheels' scales up to which tyres, loads and the ground may make it."""
 _AGREE = 1.5
 """Ratio within which driving and turning show the same scale: on grass the sides of a Warthog turn it by 1.26
@@ -102,7 +102,7 @@ def find_odd_joints(
     for name, one in joints.items():
         ratio = float(one.gains[0]) / usual if usual else 0.0
         others = [other for key, other in joints.items() if key != name and sides[key] == sides[name]]
-        is_scaled = ratio != 0.0 and abs(np.log(abs(ratio))) > np.log(_SAME)
+        is_scaled = ratio != 0.0 and abs(np.log(abs(ratio))) > np.log(SAME_SCALE)
         is_scaled = is_scaled and _is_alike(one.path, path)
         if one.follows and (ratio < 0.0 or is_scaled):
             size = snap(abs(ratio)) if is_scaled else 1.0
@@ -120,7 +120,7 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
     of_speed, of_turn = (float(one / other) for one, other in zip(left.gains, right.gains, strict=True))
     # Laps of one radius do not tell what drives from what turns.
     error = np.hypot(1.0 / left.t[0], 1.0 / right.t[0])
-    if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME) + CLEAR * error:
+    if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(SAME_SCALE) + CLEAR * error:
         return None
     if not _is_alike(left.path, right.path):
         return None
@@ -134,7 +134,7 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
 def snap(scale: float) -> float:
     """A scale above zero, or the ratio of decoders that it is near to: what remains may be the ground's."""
     ratios = [ratio for edge in _EDGES for ratio in (edge, 1.0 / edge)]
-    return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
+    return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(SAME_SCALE)), scale)
 
 
 _STEERS = 0.2

@@ -14,6 +14,7 @@ from pipeline.recording.encoders import ask_joints, ask_scales, ask_sides, read_
 from pipeline.recording.evidence import RATES, equal_motion
 from pipeline.recording.extract import Given
 from pipeline.recording.findings import Finding
+from pipeline.recording.gains import ask_gains
 from pipeline.recording.geometry import Geometry, explain_wheels
 from pipeline.recording.legs import ask_legs, ask_motion
 from pipeline.recording.lengths import ask_lengths
@@ -150,6 +151,7 @@ QUESTIONS: tuple[Callable[[Case], Case], ...] = (
     ask_signs,
     ask_driven,
     ask_units,
+    ask_gains,
     ask_delay,
     ask_mounting,
     ask_scale,

@@ -785,6 +785,7 @@ class Extraction:
         columns, clock, order = ordered
         rates, forces = topic_values.read_imu(columns)
         times = self._seconds(clock.stamp[order])
+        rates[:, 2] *= self.configuration.imu.sign or 1
         return pl.DataFrame(
             {
                 **self._time_columns(times, clock.stamp[order], columns.log_time[order]),

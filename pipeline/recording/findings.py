@@ -17,8 +17,11 @@ class StageError(SlipError):
     """A log or a table with too little data for a stage."""
 
 
-_BOUNDS = {"too_large", OVER_BUDGET}
-"""Kinds of losses of data that are whole, and more than is read."""
+_WHOLE = {
+    **dict.fromkeys(("too_large", OVER_BUDGET), "not all of the log is read"),
+    "truncated": "the file ends early, or is still being written",
+}
+"""What is said of losses, by kind, where the data that are there are whole; of others the log is damaged."""
 
 
 def blame_damage(losses: Sequence[Loss]) -> str:
@@ -27,10 +30,11 @@ def blame_damage(losses: Sequence[Loss]) -> str:
     others = f"; {further} further loss{'es' * (further > 1)}" if further else ""
     if not losses:
         return ""
-    why = "not all of the log is read" if losses[0].kind in _BOUNDS else "the log is damaged"
+    kinds = {one.kind for one in losses}
+    why = _WHOLE.get(losses[0].kind, "") if len(kinds) == 1 else ""
     if losses[0].kind == OTHER_VERSION:
         return f" ({losses[0].text}{others})"
-    return f" ({why}: {losses[0].text}{others})"
+    return f" ({why or 'the log is damaged'}: {losses[0].text}{others})"
 
 
 Severity = Literal["info", "warning", "error"]

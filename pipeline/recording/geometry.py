@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 
 from pipeline.core import NORMAL_95, fit_robustly, join_parts
-from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, STEP_S, Motion, MotionFit, Steps, fit
+from pipeline.recording.motion import CLEAR, FEWEST_STEPS, NO_MOTION, Motion, MotionFit, Steps, find_step, fit
 from pipeline.recording.readings import DELAYS_S, SIDES, UNEXPLAINED, Explained, Reading
 from pipeline.sources import RANGES, find_alike_vehicles
 
@@ -126,9 +126,9 @@ def roll_wheels(wheels: Reading) -> Motion:
         return NO_MOTION
     start = max(float(one.times[0]) for one in wheels.inputs)
     end = min(float(one.times[-1]) for one in wheels.inputs)
-    if end - start < FEWEST_STEPS * STEP_S:
+    if end <= start:
         return NO_MOTION
-    edges = np.arange(start, end, STEP_S)
+    edges = np.arange(start, end, find_step(end - start))
     steps = Steps(edges[:-1], edges[1:])
     steps = steps.take(np.logical_and.reduce([one.is_there(steps) for one in wheels.inputs]))
     if steps.start.size < FEWEST_STEPS:

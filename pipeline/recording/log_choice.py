@@ -551,13 +551,15 @@ def _list_contradictions(
 ) -> Iterator[tuple[Finding, Vehicle]]:
     """Findings on a chosen vehicle that what the log shows or says contradicts, each with that vehicle."""
     for one in witnesses:
-        differing = list_contradictions(one.vehicle, vehicle)
+        dimensions = list_contradictions(one.vehicle, vehicle)
+        differing = [*dimensions.values()]
         is_given = source in {"flag", "configuration", "metadata"} and source != one.source
         if is_given and differing and one.vehicle.sideways_preset != vehicle.id:
             values = {
                 "source": one.source,
                 "indicated": one.vehicle.name,
                 "differing": differing,
+                "dimensions": [*dimensions],
                 "vehicle": vehicle.name,
                 "is_flag": source == "flag",
             }
@@ -808,7 +810,7 @@ def _contradict_wheelbase(seen: Geometry, kind: str, given: Mapping[str, object]
     low, high = length.interval
     if abs(math.log(length.value / base)) < math.log(_ANOTHER_BASE) or low < base < high:
         return []
-    values = {"given": base, "value": length.value, "low": low, "high": high}
+    values = {"given": base, "value": length.value, "low": low, "high": high, "dimensions": ["wheelbase_m"]}
     return [Finding("wheelbase_contradicted", "warning", "vehicle", values)]
 
 

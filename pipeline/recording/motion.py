@@ -36,6 +36,9 @@ LEAST_NATS = 0.02
 """Least gain in log-likelihood per step of a decision: below it a difference is of no importance."""
 FEWEST_STEPS = 30
 """Least number of steps for a likelihood."""
+_ENOUGH_STEPS = 3 * FEWEST_STEPS
+"""Number of steps into which a record is divided at least, where its poses are as many: a signal need not be
+recorded beside all of them."""
 ONE_SCALE = 0.2
 """Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
 not."""
@@ -313,7 +316,7 @@ def measure_motion(poses: pl.DataFrame, *, is_level: bool = False) -> Motion:
     position = fresh.select("x", "y", "z").to_numpy()
     quaternion = fresh.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     period = float(np.median(np.diff(time)))
-    length = max(STEP_S, period)
+    length = find_step(time[-1] - time[0], period)
     rows = _choose_rows(time, 0.95 * length)
     if len(rows) <= FEWEST_STEPS:
         return NO_MOTION
@@ -340,6 +343,18 @@ def measure_motion(poses: pl.DataFrame, *, is_level: bool = False) -> Motion:
         turned[sane],
         up,
     )
+
+
+def find_step(lasted: float, period: float = 0.0) -> float:
+    """Length of the steps [s] of a record: of a short one they are shorter, so that they are enough.
+
+    Their noise is fitted, whatever their length.
+
+    Args:
+        lasted: from its first to its last message [s].
+        period: of its messages [s], below which no step says more; zero of what holds in between.
+    """
+    return max(period, min(STEP_S, lasted / _ENOUGH_STEPS))
 
 
 def _choose_rows(time: Floats, length: float) -> list[int]:

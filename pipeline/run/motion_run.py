@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -163,6 +164,7 @@ class MotionRun:
         is_drive_alone: whether its poses are the motion of its wheels, since none were recorded.
         in_bursts: whether it stops before the next command, and how long a command acts was found by taking
             it to be as fast as commanded.
+        contradicted: dimensions of the vehicle that findings of the run contradict, by name.
         origin: where its zero lies in the recording, see `anchored`.
         lead_s: time that it stands before it drives.
     """
@@ -183,6 +185,7 @@ class MotionRun:
     is_on_course: bool = False
     is_drive_alone: bool = False
     in_bursts: bool = False
+    contradicted: frozenset[str] = frozenset()
     origin: Origin = Origin()
     lead_s: float = 0.0
 
@@ -318,8 +321,16 @@ def load_run(
         is_on_course=_has_finding(tables.get("findings"), "heading_from_course"),
         is_drive_alone=_has_finding(tables.get("findings"), GROUND_UNOBSERVABLE),
         in_bursts=_has_finding(tables.get("findings"), IN_BURSTS),
+        contradicted=_list_contradicted(tables.get("findings")),
         lead_s=begin - float(streams[0]),
     )
+
+
+def _list_contradicted(findings: pl.DataFrame | None) -> frozenset[str]:
+    """The vehicle's dimensions that findings name as contradicted."""
+    texts = [] if findings is None or findings.is_empty() else findings["values"].to_list()
+    values = [json.loads(text) for text in texts if text and "dimensions" in text]
+    return frozenset(name for one in values for name in one.get("dimensions", ()))
 
 
 def _has_finding(findings: pl.DataFrame | None, name: str) -> bool:

@@ -264,11 +264,13 @@ class ImuSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     Attributes:
         topic: with the rates of turning.
         unit: of the rates; by default that of the message type.
+        sign: -1 if turning to the left is recorded as negative.
         time: which of the message's times to use.
     """
 
     topic: str | None = None
     unit: Literal["rad/s", "deg/s"] | None = None
+    sign: Literal[1, -1] | None = None
     time: Clock | None = None
 
 
@@ -332,7 +334,7 @@ AS_RECORDED: Final[Mapping[str, Mapping[str, object]]] = {
     "command": {**_DRIVE_AS_RECORDED, "unit": "m/s"},
     "wheels": {**_DRIVE_AS_RECORDED, "unit": "rad/s"},
     "pose": {"axes": "enu", "up": "z", "heading_deg": 0, "unit": "m"},
-    "imu": {"unit": "rad/s"},
+    "imu": {"unit": "rad/s", "sign": 1},
 }
 """Values by section and key that change nothing of a usual log: written, they keep it as it is recorded."""
 

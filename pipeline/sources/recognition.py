@@ -346,11 +346,11 @@ def find_alike_vehicles(radius_m: float, track_m: float) -> dict[str, tuple[str,
     return dict(sorted(alike, key=lambda item: abs(item[1][1] - 1.0)))
 
 
-def list_contradictions(recognized: Vehicle, chosen: Vehicle) -> list[str]:
-    """Values in which the recognized and the chosen vehicle differ too much to be the same vehicle."""
+def list_contradictions(recognized: Vehicle, chosen: Vehicle) -> dict[str, str]:
+    """Keys in which the recognized and the chosen vehicle differ too much to be the same, and how."""
     # A description of four wheels does not show whether they have rollers; the commands do.
     steered, is_car = (one.kinematics.has_inputs("steering") for one in (recognized, chosen))
-    differing = [] if steered == is_car else [f"kind {recognized.kind}, not {chosen.kind}"]
+    differing = {} if steered == is_car else {"kind": f"kind {recognized.kind}, not {chosen.kind}"}
     for name, limit in (
         ("wheel_radius_m", _DIFFERS),
         ("track_width_m", _OTHER_TRACK),
@@ -358,7 +358,7 @@ def list_contradictions(recognized: Vehicle, chosen: Vehicle) -> list[str]:
     ):
         said, taken = getattr(recognized, name), getattr(chosen, name)
         if said and taken and abs(said / taken - 1.0) > limit:
-            differing.append(f"{name} {said:.4g}, not {taken:g}")
+            differing[name] = f"{name} {said:.4g}, not {taken:g}"
     return differing
 
 

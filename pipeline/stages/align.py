@@ -6,6 +6,7 @@ tables and as numbers, so that every reader of the run gets corrected data.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -66,6 +67,7 @@ def align_tables(
     body_commanded: bool,
     where: str,
     is_drive_alone: bool = False,
+    has_gyro_sign: bool = False,
 ) -> Aligned:
     """Align a run.
 
@@ -78,6 +80,7 @@ def align_tables(
         where: the run, for error messages.
         is_drive_alone: whether the poses are the motion of the measured wheels, since none were recorded:
             they have no clock of their own.
+        has_gyro_sign: whether the user gives the sign of the gyro: with another one it is not used.
     """
     recorded, commands = (tables.get(name, pl.DataFrame()) for name in ("wheels", "commands"))
     echo = check_echo(commands, recorded, vehicle, body_commanded=body_commanded)
@@ -88,14 +91,18 @@ def align_tables(
     if not commands.is_empty() and known.hold_s is None:
         known = replace(known, hold_s=usual_hold(commands["t"].to_numpy()))
     multiplier = _find_body_multiplier(commands, vehicle, known, body_commanded=body_commanded)
-    poses, alignment = align_poses(
-        {**tables, "commands": asked, "wheels": wheels},
-        aligned_vehicle,
-        replace(known, body_multiplier=multiplier),
+    align = partial(
+        align_poses,
+        vehicle=aligned_vehicle,
+        alignment=replace(known, body_multiplier=multiplier),
         is_live=_find_live(tables["poses"], asked, known.hold_s),
         is_localization=not is_drive_alone,
         where=where,
     )
+    driven = {**tables, "commands": asked, "wheels": wheels}
+    poses, alignment = align(driven)
+    if has_gyro_sign and alignment.gyro is not None and alignment.gyro.signed_scale < 0.0:
+        poses, alignment = align({**driven, "imu": pl.DataFrame()})
     late = measure_wheel_delay(wheels, tables.get("imu", pl.DataFrame()), alignment.gyro, aligned_vehicle)
     alignment = replace(alignment, wheel_delay_s=late)
     if echo:

@@ -110,9 +110,8 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
             values = {"kind": "of the motion", "value": gain, "unit": unit, "fastest_mps": fastest}
             return [Finding("unit_wrong", "error", "wheels", values)]
     radius = vehicle.wheel_radius_m
-    return [
-        Finding(WRONG_RADIUS, "error", "wheels", {"value": radius * gain, "gain": gain, "radius_m": radius})
-    ]
+    values = {"value": radius * gain, "gain": gain, "radius_m": radius, "dimensions": ["wheel_radius_m"]}
+    return [Finding(WRONG_RADIUS, "error", "wheels", values)]
 
 
 def is_grip(gain: float, others: Iterable[float]) -> bool:

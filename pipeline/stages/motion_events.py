@@ -24,8 +24,6 @@ _FALSE_MOTION = {"pushed", "localization_frozen"}
 """Incidents in which the body's motion says nothing about the ground under the wheels."""
 _WIDTH = 5
 """Samples over which the size of an event is averaged: shorter peaks are noise of the poses."""
-_FEWEST = 40
-"""Least number of samples for a usual ratio: two seconds of driving."""
 _SMOOTH_S = 0.5
 """Width of a running mean [s], below the 0.75 s over which poses are differentiated."""
 _JOINED_S = 1.5
@@ -117,9 +115,7 @@ def _smooth(times: Floats, values: Floats) -> Floats:
 def _measure_gain(rims: Rims, driven: Floats, moved: Floats) -> float:
     """Usual ratio of the body's forward motion to that of the wheels; 0 if the wheels never moved."""
     turning = np.abs(driven) > LIVE * rims.top
-    if turning.sum() < _FEWEST:
-        return 0.0
-    return max(float(np.median(moved[turning] / driven[turning])), 0.0)
+    return max(float(np.median(moved[turning] / driven[turning])), 0.0) if turning.any() else 0.0
 
 
 def _count_sideways(moved: Floats, brought: Floats) -> Floats:

@@ -42,6 +42,7 @@ from pipeline.results import (
 from pipeline.run import HORIZON_S
 from pipeline.words.effects import (
     describe_cause,
+    describe_instead,
     describe_motion,
     describe_number,
     describe_separation,
@@ -225,11 +226,14 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     unseen = [one for one in named if one not in shown]
     ranked = rank_main(run)
     by_share = sorted((one.id for one in shown if one.id in ranked), key=lambda name: -ranked[name])
-    hidden = by_share[_EFFECTS_SHOWN:]
+    listed = [one for one in shown if one.id not in by_share[_EFFECTS_SHOWN:] or one.stands_out]
     rows = [
-        (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
-        for effect in shown
-        if effect.id not in hidden
+        (
+            name_term(effect.id),
+            falls.get(effect.id, ""),
+            ", ".join(filter(None, (f"{effect.id}: {format_short(effect)}", describe_instead(effect, run)))),
+        )
+        for effect in listed
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     texts = [
@@ -241,7 +245,8 @@ def _list_main(run: RunDiagnosis) -> list[str]:
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
     texts += _list_raising(run)
     folded = len(unseen) + len(minor)
-    counts = [format_count(len(hidden), "more effect")] if hidden else []
+    hidden = len(shown) - len(listed)
+    counts = [format_count(hidden, "more effect")] if hidden else []
     counts += [format_count(folded, "smaller effect")] if folded else []
     counts += [f"{len(small)} undecided"] if small else []
     if counts:
@@ -251,16 +256,22 @@ def _list_main(run: RunDiagnosis) -> list[str]:
 
 
 def _list_raising(run: RunDiagnosis) -> list[str]:
-    """The named effects that raise an error over 2 s and lower none."""
+    """The named effects that raise one error over 2 s by more than they lower the other."""
     named = {effect.id for effect in run.effects}
     return [
         f"with {name_term(name)} the {format_rises(before, after)}: it is named because the motion over "
         "shorter times is more likely with it"
         for before, after in pairwise(run.ladder)
-        if list_rises(before, after, CHANCE) and not list_rises(after, before, CHANCE)
+        if list_rises(before, after, CHANCE) and _measure_change(before, after) > 0.0
         for name in list_added(before, after)
         if name in named
     ]
+
+
+def _measure_change(before: Step, after: Step) -> float:
+    """Logarithm of the product of the errors over 2 s after a step over that before it."""
+    pairs = ((getattr(before, key), getattr(after, key)) for key in ERRORS_OVER_2S)
+    return sum(math.log(new / old) for old, new in pairs if old > 0.0 < new)
 
 
 def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:

@@ -96,6 +96,16 @@ def describe_clause(effect: Named, run: RunDiagnosis) -> str:
     return "" if len(effect.own) > 1 else _join_range(texts)
 
 
+def describe_instead(effect: Named, run: RunDiagnosis) -> str:
+    """What no recording like this one distinguishes from an effect, in a few words; empty without that."""
+    if not effect.equivalent_to:
+        return ""
+    text, vehicle = "", run.vehicle
+    if vehicle is not None and effect.id in _list_known() and not effect.own:
+        text = restore_known(effect.id, effect.parameters).describe_instead(vehicle)
+    return f"or {text or ' or '.join(map(name_term, effect.equivalent_to))}"
+
+
 @lru_cache(maxsize=8)
 def _read_effects(model: str) -> tuple[Effect, ...]:
     file = read_model(RunDiagnosis(model=model))

@@ -366,6 +366,19 @@ def _wheel_radius_wrong(of: Values) -> str:
     )
 
 
+def _gain_assumed(of: Values) -> str:
+    lines = " and ".join(f"[{one}]" for one in of["sections"])
+    ratio = of["scale"]
+    is_computed = of["by"] == "odometry"
+    source = f"{of['source']} of this log" if is_computed else f"the way of {of['source']}"
+    return (
+        f"a gain of {of['used']:g} {of['unit']} per m/s is assumed, that of the preset; {source} says "
+        f"{of['value']:.4g}, so that the speeds of {lines} are {max(ratio, 1.0 / ratio):.2g} times too "
+        f"{'large' if ratio < 1.0 else 'small'}{'' if is_computed else ', if it is no slip'}: "
+        f"scale = {ratio:.4g} under {lines} in run.toml corrects them"
+    )
+
+
 def _hardly_commanded(of: Values) -> str:
     text = f"the vehicle was hardly commanded to move: {of['value']:.2g} m of path in the whole run"
     if "moved_m" in of:
@@ -541,8 +554,9 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "imu_unchecked": "the vehicle turned too little to check the gyro against the poses: it was not used",
     "imu_disagrees": "the gyro does not agree with the poses, or is silent in part of the run: it was not "
     "used",
-    "imu_sign": "the gyro's yaw rate has the wrong sign and was inverted: it then differs from the yaw rate "
-    "of the poses by {residual:share}",
+    "imu_sign": "the gyro's yaw rate has the wrong sign and was inverted, as sign = -1 under [imu] in "
+    "run.toml does; sign = 1 takes it as recorded: inverted, it differs from the yaw rate of the poses by "
+    "{residual:share}",
     "imu_scale": "the poses turn {value:.3f} times as much as the gyro says: it was scaled",
     "imu_bias": "the gyro has a bias of {value:.4f} rad/s against the poses: it was removed",
     "imu_gap": "the gyro is silent in {count} time steps: the poses' yaw rate is used there",
@@ -591,6 +605,7 @@ _STAGES: Mapping[str, Template | Mapping[str, Template]] = {
     "heading_skew": _heading_skew,
     "wheel_scale": _wheel_scale,
     "wheel_radius_wrong": _wheel_radius_wrong,
+    "gain_assumed": _gain_assumed,
     "wheels_dead": "the measured wheels are zero throughout while commands are live: an emergency stop was "
     "pressed, or the encoders are dead",
     "not_moving": {

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 
 from pipeline.core import enumerate_texts, format_share
-from pipeline.models import name_term
+from pipeline.models import FEW_STRETCHES, name_term
 from pipeline.recording import Finding
 from pipeline.results import (
     ABOVE_FLOOR,
@@ -13,6 +13,7 @@ from pipeline.results import (
     CHANGE,
     ERRORS_OVER_2S,
     SEARCH_CUT,
+    Named,
     RunDiagnosis,
     Step,
     find_refusal,
@@ -29,7 +30,9 @@ from pipeline.words.findings import format_finding
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
 _NOTHING_EVIDENT = "No effect is evident"
+_ASSUMED = "its speeds are by an assumed gain of {used:g}, where this log says {value:.4g}"
 NO_GROUND = "the log holds no pose: slip is that of the wheels against their commands, not that of the ground"
+_TENTATIVE = " (tentative)"
 _UNKNOWN = "no known effect explains the rest"
 _MOST_CLAUSES = 3
 """Effects that a verdict names; others are in the table below it."""
@@ -59,6 +62,7 @@ def format_verdict(run: RunDiagnosis) -> str:
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
     opening = f"Over {HORIZON_S:g} s the ideal model is {format_step(ladder[0])} off"
     scope = [NO_GROUND] if has_no_pose(run.findings) else []
+    scope += [_ASSUMED.format(**one.values) for one in run.findings if one.id == "gain_assumed"]
     is_sized = not math.isnan(ladder[0].t_mrmse_m)
     if not is_sized:
         opening = "No stretch of good poses is long enough to tell an error"
@@ -149,12 +153,17 @@ def _list_clauses(run: RunDiagnosis) -> list[str]:
     named = {one.id: one for one in run.effects if one.is_determined}
     ranked = rank_main(run)
     clauses = {
-        name: clause
+        name: f"{clause}{_TENTATIVE * _is_tentative(named[name])}"
         for name in ranked
         if name in named and name not in undecided and (clause := describe_clause(named[name], run))
     }
     largest = sorted(clauses, key=lambda name: -ranked[name])[:_MOST_CLAUSES]
     return [clause for name, clause in clauses.items() if name in largest]
+
+
+def _is_tentative(effect: Named) -> bool:
+    """Whether few stretches of the drive tell one of its numbers."""
+    return any(value.doubt == FEW_STRETCHES for value in effect.parameters.values())
 
 
 def _describe_choice(run: RunDiagnosis) -> str:

@@ -119,12 +119,12 @@ def test_results_that_were_made_otherwise_are_not_replaced_without_a_word(
         "made with use_intervals = all (now recorded) and model = not set (now model.toml); "
         in print_verb(*analyze, "--model", model)
     )
-    batch = ("batch", log, "--executor", "inline", "--results", tmp_path / "out", "--vehicle", "warthog")
-    assert "earlier results, made with vehicle.preset = not set (now warthog)" in print_verb(*batch)
+    batch = ("batch", log, "--executor", "inline", "--results", tmp_path / "out", "--vehicle", "panther")
+    assert "earlier results, made with vehicle.preset = not set (now panther)" in print_verb(*batch)
     (line,) = ask_verb(*batch[:-1], "husky_a200")["logs"]
-    assert line["replaced"].startswith("made with vehicle.preset = warthog (now husky_a200); ")
+    assert line["replaced"].startswith("made with vehicle.preset = panther (now husky_a200); ")
     (line,) = ask_verb(*batch, "--prune", "--keep", 0)["logs"]
-    assert line["replaced"].endswith("preset = husky_a200 (now warthog); they were removed")
+    assert line["replaced"].endswith("preset = husky_a200 (now panther); they were removed")
     stage = ("results", "stage", "slip", log, "--results", tmp_path / "out", "--force")
     assert "with a summary, which the new ones lack; " in print_verb(*stage)
 

@@ -14,10 +14,11 @@ from verbs import run_verb
 
 from pipeline import export
 from pipeline.core import PACKAGE, read_version, split_interval
-from pipeline.export import Facts, export_model, list_targets
+from pipeline.export import REACHED_ACCELERATION, Facts, export_model, list_targets
 from pipeline.export.spread import find_response
-from pipeline.models import find_effect, format_model, list_effects, name_term, predict_step
+from pipeline.models import find_effect, format_model, list_effects, name_term, predict_step, read_model
 from pipeline.run import MotionError
+from pipeline.simulate import simulate_case
 from pipeline.sources import Vehicle, list_presets
 
 PARAMETERS = sorted(SCHEMAS)
@@ -295,6 +296,41 @@ def test_a_length_alone_makes_no_deadband() -> None:
     _, _, unknown = text.partition("Not written, as no effect of the model determines it:")
     assert "VelocityDeadbandCritic.deadband_velocities" in unknown
     assert "deadband_velocities:" not in text
+
+
+def test_a_dimension_that_the_runs_contradict_is_a_comment_until_it_is_changed() -> None:
+    """A radius that was twice the true one was told of, and went into the controller without a word."""
+    file = make(fit={**FIT, "contradicted": {"wheel_radius_m": HUSKY.wheel_radius_m}})
+    said = "in doubt: findings of the runs of the fit contradict it"
+    assert f"# wheel_radius_m is {said}" in format_model(file)
+    text = export_model(file, "ros2_control")
+    assert f"# vehicle husky_a200: wheel_radius_m, {said}\n    # wheel_radius: 0.165" in text
+    assert "\n    wheel_separation: 0.55" in text
+    other = make(vehicle=msgspec.structs.replace(HUSKY, wheel_radius_m=0.17), fit=file.fit)
+    assert "\n    wheel_radius: 0.17" in export_model(other, "ros2_control")
+
+
+def test_a_fit_notes_the_dimensions_that_its_run_contradicts(tmp_path: Path) -> None:
+    log, model = tmp_path / "log.mcap", tmp_path / "m.toml"
+    simulate_case("ideal_husky", {"effective_track": 1.6}, out=log, duration_s=100.0)
+    (tmp_path / "run.toml").write_text('[vehicle]\npreset = "husky_a200"\nwheel_radius_m = 0.2\n')
+    run_verb("diagnose", log, "--apply", model, "--results", tmp_path / "results")
+    file = read_model(model)
+    assert file.contradicted == ["wheel_radius_m"]
+    (run,) = file.list_fitted("runs")
+    assert 0.5 < run[REACHED_ACCELERATION] < 20.0  # type: ignore[operator]
+
+
+def test_an_acceleration_is_exported_as_the_robot_reaches_it() -> None:
+    """A limit of commands, which slow motors follow late, was higher than any acceleration of the drive."""
+    (run,) = FIT["runs"]  # type: ignore[misc]
+    slow = {**FIT, "runs": [{**run, REACHED_ACCELERATION: 3.1}]}  # type: ignore[misc]
+    limit = find_effect("body_acceleration_limit")(limit=5.35)
+    known = {"body_acceleration_limit.limit": (5.1, 5.6)}
+    text = export_model(make(limit, fit=slow, intervals=known), "ros2_control")
+    assert "no more than was driven: 3.1 m/s^2" in text
+    assert "max_acceleration: 3.1\n" in text
+    assert "max_acceleration: 5.35\n" in export_model(make(limit, fit=FIT, intervals=known), "ros2_control")
 
 
 @pytest.mark.parametrize(("turned", "drove"), [(0.108, 1.97), (0.9, 0.05)])

@@ -468,6 +468,35 @@ def test_the_radius_of_the_wheels_of_an_unknown_car_is_no_scale_of_its_commands(
     assert "times as fast as commanded" not in told(setup)
 
 
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_speed_that_counts_backward_is_corrected_in_a_drive_of_three_seconds(
+    sense: float, tmp_path: Path
+) -> None:
+    """It has less than thirty steps of a tenth of a second in motion: nothing was asked of its signs."""
+    rng, radius, wheelbase = np.random.default_rng(3), 0.05, 0.25
+    time = np.arange(0.0, 3.2, 0.02)
+    asked, angle = np.where(time > 0.2, 2.5, 0.0), 0.2 * np.sin(3.0 * time)
+    speed = np.clip(2.5 * (time - 0.3) / 0.6, 0.0, 2.5)
+    yaw = np.cumsum(speed * np.tan(angle) / wheelbase) * 0.02
+    place = np.cumsum(speed * np.exp(1j * yaw)) * 0.02 + rng.normal(0.0, 5e-4, (2, time.size)).T @ (1.0, 1j)
+    does = DrawnDrive(time, speed, 0.0 * yaw, place.real, place.imag, yaw)
+    turned, none = sense * speed / radius, 0.0 * angle
+    joints = stamp_ros(does) | {
+        "name": [["rear_left_wheel_joint", "rear_right_wheel_joint", "front_steering_joint"]] * time.size,
+        "position": np.column_stack((none, none, angle)).tolist(),
+        "velocity": np.column_stack((turned, turned, none)).tolist(),
+    }
+    wish = stamp_ros(does) | {"drive.speed": asked, "drive.steering_angle": angle}
+    setup = set_up(
+        tmp_path,
+        record_cdr(does, "/drive", "ackermann_msgs/msg/AckermannDriveStamped", wish),
+        record_cdr(does, "/joint_states", JOINTS, joints),
+        record_cdr(does, "/mocap", POSE, stamp_ros(does) | does.pose("pose.") | {"header.frame_id": "map"}),
+    )
+    assert setup.configuration.wheels.sign == (-1 if sense < 0.0 else None)
+    assert ("counts backward: corrected" in told(setup)) == (sense < 0.0)
+
+
 @pytest.mark.parametrize("axles", [("",), ("front_", "rear_")], ids=["sides", "axles"])
 def test_numbers_named_as_sides_are_the_wheels_where_nothing_else_drives(
     axles: tuple[str, ...], tmp_path: Path

@@ -152,5 +152,5 @@ def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None
     (text,) = [one.fields["data"] for one in PLATFORMS["youbot"].topics if "description" in one.topic]
     described = recognize_vehicle([], {}, read_description(str(text).replace("youbot", "my_robot")))
     assert described.vehicle.kind == "differential"
-    assert list_contradictions(described.vehicle, youbot) == []
-    assert "kind differential, not ackermann" in list_contradictions(described.vehicle, car)
+    assert list_contradictions(described.vehicle, youbot) == {}
+    assert list_contradictions(described.vehicle, car)["kind"] == "kind differential, not ackermann"

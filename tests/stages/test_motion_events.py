@@ -111,6 +111,17 @@ def test_a_sensor_ahead_of_the_axles_is_not_seen_to_slide_in_turns() -> None:
     assert find_events(pl.DataFrame(columns), inputs, vehicle, Spans(flags, flags)).findings == ()
 
 
+def test_a_body_of_a_short_drive_that_lags_behind_its_wheels_does_not_slide() -> None:
+    """Of less than two seconds of driving no usual ratio was known, and any motion was more than none."""
+    times = np.arange(0.0, 3.0, STEP_S)
+    wheels = np.clip(4.0 * (times - 0.5), 0.0, 4.0) * (times < 2.3)
+    flags, still = np.zeros(times.size, dtype=bool), np.zeros(times.size)
+    columns = {"t": times, "v_x": 0.6 * wheels, "v_y": still, "v_w": still, "x": times, "y": still}
+    inputs = {"measured": Ideal(np.column_stack((wheels, still, still)), flags, ~flags)}
+    made = find_events(pl.DataFrame(columns), inputs, find_preset("f1tenth"), Spans(flags, flags))
+    assert made.findings == ()
+
+
 def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Path:
     at = np.arange(0.0, 89.0, 0.1)
     ahead = Commands(at, np.where(at % 30.0 < 27.0, 0.6, 0.0), 0.3 * (at % 30.0 < 8.0))

@@ -124,6 +124,16 @@ def test_further_losses_are_counted_in_words() -> None:
     assert blame_damage(losses).endswith("hold no record; 2 further losses)")
 
 
+def test_a_file_that_ends_early_is_not_called_damaged() -> None:
+    """`slip watch` said so of every recording that was being written."""
+    cut = Loss("truncated", "its last 1350 bytes are no complete record", bytes=1350)
+    assert blame_damage([cut]) == (
+        " (the file ends early, or is still being written: its last 1350 bytes are no complete record)"
+    )
+    broken = Loss("damaged_record", "bytes 5 to 9 hold no record", bytes=4)
+    assert blame_damage([cut, broken]).startswith(" (the log is damaged: ")
+
+
 @pytest.mark.parametrize("step", [3, 101])
 def test_absurd_numbers_are_said_and_warn_nobody(tmp_path: Path, whole: bytes, step: int) -> None:
     """Tests turn every warning of numpy into an error."""

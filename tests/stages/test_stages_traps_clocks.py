@@ -18,6 +18,7 @@ from pipeline.run import Alignment
 from pipeline.simulate import Clock, Encoders, Imu, Program, Recording, Scenario
 from pipeline.stages.align import align_tables
 from pipeline.stages.trust import estimate_delay
+from pipeline.words import format_finding
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
@@ -253,6 +254,18 @@ def test_trap_6_the_sign_of_the_gyro_is_checked_and_corrected(drive: TakeThrough
     assert ("imu_sign" in taken.ids()) == (sign < 0)
     velocities = taken.velocities
     assert rms(velocities["v_w_imu"] - velocities["v_w"]) < 0.03
+
+
+def test_trap_6_a_sign_of_the_gyro_that_is_written_counts(drive: TakeThrough) -> None:
+    """The gyro was inverted without the line that does it, and there was none."""
+    inverted = replace(FIELD, imu=Imu(sign=-1))
+    assert "sign = -1 under [imu]" in format_finding(drive(inverted).finding("imu_sign"))
+    written = drive(inverted, {"imu": {"sign": -1}})
+    assert not written.ids() & {"imu_sign", "imu_disagrees"}
+    assert rms(written.velocities["v_w_imu"] - written.velocities["v_w"]) < 0.03
+    kept = drive(inverted, {"imu": {"sign": 1}})
+    assert "imu_disagrees" in kept.ids()
+    assert "imu_sign" not in kept.ids()
 
 
 def test_trap_6_scale_and_bias_of_the_gyro_are_found_and_taken_off(drive: TakeThrough) -> None:

@@ -69,6 +69,30 @@ def test_no_effect_is_hidden_that_removes_more_than_one_that_is_shown() -> None:
     assert [text in list_lines(run)[0][1] for text in texts] == [True, False, True, True, False]
 
 
+def test_an_effect_that_nothing_distinguishes_from_another_says_what_else_it_may_be() -> None:
+    """Late poses and an antenna's place stood behind `--all` only, as ids."""
+    values = {"transport_delay": {"d": 0.25}, "icr_offset": {"x_icr": -1.1}, "drive_lag": {"tau": 0.25}}
+    drawn = draw_diagnosis(values, [(1.0 - 0.2 * count, 0.5) for count in range(4)])
+    others = ("clock_offset",), ("lever_arm",), ("body_inertia",)
+    same = [replace(one, equivalent_to=ids) for one, ids in zip(drawn.effects, others, strict=True)]
+    run = replace(drawn, effects=tuple(same))
+    texts = [text for label, text in list_lines(run) if label != "verdict"]
+    assert texts[0].endswith(", or the poses are 0.25 s late")
+    assert texts[1].endswith(", or the poses are of a point 1.1 m ahead of base_link")
+    assert texts[2].endswith(", or body inertia")
+    plain = [text for _, text in list_lines(replace(run, effects=drawn.effects))]
+    assert not any(", or " in text for text in plain)
+
+
+def test_a_difference_of_the_sides_is_on_the_screen_however_little_error_it_makes() -> None:
+    """An encoder 6 % off was behind `--all`, as two effects below their typical sizes."""
+    many = {name: {} for name in MANY} | {"side_gain": {"e": 0.03}, "speed_track": {"k": 0.011}}
+    run = draw_diagnosis(many, [(1.0 - 0.1 * count, 0.5) for count in range(8)] + [(0.3, 0.5), (0.3, 0.5)])
+    shown = [text for label, text in list_lines(run) if label != "verdict"]
+    assert shown[5].startswith("side gain")
+    assert shown[6] == "2 more effects, and 1 smaller effect (each below a tenth of every error; --all)"
+
+
 def test_the_first_line_says_which_runs_are_simulated() -> None:
     runs = [RunDiagnosis(run=f"field/{number}", input="command") for number in range(5)]
     first = [describe(runs[:1], simulated=names).splitlines()[0] for names in ([], ["field/0"])]
@@ -278,6 +302,12 @@ def test_an_effect_that_only_raises_errors_is_said_to_do_so() -> None:
     assert not [text for _, text in list_lines(better) if " rises by " in text]
     everything = " ".join(text for _, text in list_lines(better, everything=True))
     assert "35 -> 30 cm; heading error rises by 6 %" in everything
+    # Twice the position error for a twentieth of the heading error stood behind `--all`.
+    worse = replace(
+        drawn, ladder=(*drawn.ladder[:3], replace(drawn.ladder[3], t_mrmse_m=0.7, r_mrmse_rad=0.19))
+    )
+    (line,) = [text for _, text in list_lines(worse) if " rises by " in text]
+    assert line.startswith("with turning lag the position error rises by 100 %: it is named")
 
 
 def test_it_is_said_where_a_vehicle_stands_for_a_large_part_of_the_time() -> None:

@@ -58,6 +58,17 @@ def test_every_effect_reads_well_in_a_verdict() -> None:
         assert re.search(r"\. (The robot [a-z]+s |The [a-z]+ )", verdict)
 
 
+def test_an_effect_that_few_stretches_tell_is_no_plain_fact() -> None:
+    drawn = draw_diagnosis(
+        {"time_drift": {"k": 0.08}, "drive_lag": {"tau": 0.3}}, [(1, 1), (0.6, 0.5), (0.1, 0.1)]
+    )
+    first, second = drawn.effects
+    few = {"k": replace(first.parameters["k"], doubt="few_stretches", stretches=3)}
+    run = replace(drawn, effects=(replace(first, parameters=few), second))
+    assert "at its start (tentative) and follows commands with" in format_verdict(run)
+    assert "tentative" not in format_verdict(drawn)
+
+
 def test_a_verdict_names_the_effect_that_evidence_is_wanting_for() -> None:
     drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.4, 0.3)])
     why = "it shows in too few stretches of the drive (52 % of resampled recordings, 85 % required)"

@@ -26,6 +26,7 @@ MotorImbalance = declare(
         least=Least(0.01, Least.DATA_SHEET),
         plausible=Plausible(-0.5, 0.5, "a larger difference is a fault of one motor"),
         level=Level.VEHICLE,
+        of_sides=True,
     ),
     rank=30,
     kinds=("differential",),

@@ -21,6 +21,7 @@ SideGain = declare(
         0.05,
         least=Least(0.005, Least.DATA_SHEET),
         plausible=Plausible(-0.3, 0.3, "a larger difference is a fault of one motor"),
+        of_sides=True,
     ),
     rank=1,
     kinds=("differential", "mecanum"),

@@ -22,6 +22,7 @@ WheelAsymmetry = declare(
         plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),
         quantities=(Quantity.RADIUS_DIFFERENCE,),
         between_runs=Spread(0.016),
+        of_sides=True,
     ),
     rank=10,
     kinds=("differential", "mecanum"),
