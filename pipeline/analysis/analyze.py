@@ -32,6 +32,7 @@ from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
 from pipeline.logs import LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_result
+from pipeline.sources import list_configuration_files
 from pipeline.store import (
     DIAGNOSIS,
     JSON,
@@ -480,10 +481,10 @@ def _find_changes(path: Path, stored: Manifest, options: Options, *, asked: bool
     """What an analysis would now use another of: vehicle or configuration; empty if nothing changed."""
     try:
         setup = set_up_log(path, options)
-    except SlipError:
-        if asked:
+    except SlipError as error:
+        # Without the options of its analysis the log may be insufficient; a file beside it may be wrong.
+        if asked or any(str(file) in (error.where or "") for file in list_configuration_files(path)):
             raise
-        # Without the options of its analysis, the log alone may be insufficient.
         return ""
     now = {
         "configuration": msgspec.to_builtins(setup.configuration),

@@ -323,7 +323,8 @@ def explain_unread(log: Path) -> str:
                 unread.append(file.name)
     if not unread:
         return ""
-    name = RUN_FILE if path.is_dir() else f"{RUN_FILE} or {stem_of(log)}.toml"
+    names = dict.fromkeys((RUN_FILE, RUN_FILE if path.is_dir() else f"{stem_of(log)}.toml"))
+    name = " or ".join(names)
     verb, it = ("is", "it") if len(unread) == 1 else ("are", "one of them")
     return f"{name_first(unread)} beside the log {verb} not read: name {it} {name}, or give it with --config"
 

@@ -44,6 +44,18 @@ def test_results_that_do_not_tell_a_vehicle_are_one_line(
     assert "do not say which vehicle" in line
 
 
+@pytest.mark.parametrize("text", ["[vehicel]\n", "[vehicle\n", '[vehicle]\npreset = "jackal_j100"\n'])
+def test_a_wrong_configuration_is_told_where_results_exist(
+    place: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    """The answer of before was given without a word."""
+    log, configuration = place / "field" / "wide.mcap", place / "field" / "run.toml"
+    configuration.write_text(text)
+    assert slip("diagnose", log, "--results", place / "results") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(configuration) in line
+
+
 @pytest.mark.parametrize("to", ["mcap", "csv", "parquet"])
 def test_a_damaged_table_is_not_exported(place: Path, capsys: pytest.CaptureFixture[str], to: str) -> None:
     path = Store(place / "results").manifests()[0].path("slip")
